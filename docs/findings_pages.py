@@ -34,7 +34,7 @@ from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
 from test_convention import examples as convention_examples  # noqa: E402
-from test_findings import FAULTS  # noqa: E402
+from test_findings import FAULTS, TUNED_IDS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
 from test_source_values import examples as value_examples  # noqa: E402
 
@@ -153,8 +153,7 @@ def examples() -> dict[str, Example]:
         if fault.id in made:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
-        is_tuned = fault.id == "process_noise_near_zero" or "sigma_z_asked_m" in fault.evidence
-        analysis = with_noises(comparison) if is_tuned else unexplained(comparison)
+        analysis = (with_noises if fault.id in TUNED_IDS else unexplained)(comparison)
         found = [one for one in find(analysis) if one.id == fault.id]
         keep(found, "a simulated flight of the tests", analysis)
     return made

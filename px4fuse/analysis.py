@@ -9,6 +9,7 @@ from px4fuse.comparison.causal_replays import Reruns
 from px4fuse.comparison.estimates import Estimates
 from px4fuse.comparison.flight_events import Events
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.comparison.trials import Trial
 from px4fuse.core.notebook_display import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -30,7 +31,7 @@ class Analysis(Comparison, Estimates, Reruns):
         See :class:`~px4fuse.comparison.model.Comparison`.
     tuning, clock, heading, bias_scale_jump_fit, source_low_pass, time_correlated_noise
         See :class:`~px4fuse.comparison.estimates.Estimates`.
-    ekf2_model, difference_steps, causes, trials
+    ekf2_model, difference_steps, trials
         See :class:`~px4fuse.comparison.causal_replays.Reruns`.
     events : Events
         Gaps, rejections, resets and flight modes, for time plots.
@@ -58,6 +59,12 @@ class Analysis(Comparison, Estimates, Reruns):
         """Replay of EKF2 with the parameters as flown, and its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
+
+    @property
+    def main_trials(self) -> list[Trial]:
+        """Re-runs of both filters along the main axis, with statistics before from the log."""
+        main = self.main.axis.name
+        return [trial for trial in self.trials if trial.axis == main and trial.is_logged]
 
     @property
     def secondary_axes(self) -> list[AxisComparison]:

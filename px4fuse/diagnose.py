@@ -1,7 +1,12 @@
-"""Diagnosis of one flight from its request, stage by stage as in the lab.
+"""Diagnosis of one flight from its request, in the order of the lab.
 
-Read the log, prepare source and axes, run KF and compare with EKF2, estimate noises and time
-offset, re-run the filters with one change each, and find mistakes.
+1. read: log → Flight
+2. prepare: position source, time span and axes
+3. filter: run KF along each axis
+4. compare: KF, EKF2 and ground truth
+5. estimate: noises, time offset, frame misalignment, biases
+6. intervene: re-run both filters with one change at a time
+7. find: faults of the flight, with their causes
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from msgspec import structs
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
@@ -34,8 +39,6 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
@@ -56,7 +59,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, explain the differences and find mistakes.
+    """Read a flight, compare KF with EKF2, explain the differences and find faults.
 
     Parameters
     ----------
@@ -73,74 +76,29 @@ def diagnose(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
+    flight = flight or read_flight(request, progress)
     prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
-    return replace(explain(compare(prepared, progress), progress), request=request)
+    kf_runs = run_kf(prepared, progress)
+    comparison = compare(prepared, kf_runs)
+    return replace(explain(comparison, progress), request=request)
 
 
-def explain(compared: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate noises and time offset, re-run both filters with changes, and find mistakes."""
-    estimates = estimate(compared, progress)
-    progress("replaying EKF2")
-    reruns = intervene(compared, estimates)
+def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate noises and time offset, re-run both filters with changes, and find faults."""
+    estimates = estimate(comparison, progress)
+    reruns = intervene(comparison, estimates, progress)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     analysis = Analysis(
-        **vars(compared),
+        **vars(comparison),
         **vars(estimates),
         **vars(reruns),
-        events=collect_events(compared),
-        aids=evaluate_aids(compared.flight),
-        loop=analyse_flight_loop(compared.flight, progress),
+        events=collect_events(comparison),
+        aids=evaluate_aids(comparison.flight),
+        loop=analyse_flight_loop(comparison.flight, progress),
     )
     return replace(analysis, findings=find(analysis))
-
-
-def intervene(compared: Comparison, estimates: Estimates) -> Reruns:
-    """Replay EKF2, replace the properties of KF by those of EKF2, and re-run both with changes."""
-    corrected = corrected_settings(compared, estimates.tuning)
-
-    def needed_configurations(inputs: Inputs) -> list[FilterConfiguration]:
-        return [
-            *explanation_configurations(compared, inputs, corrected),
-            *planned_configurations(compared, estimates, inputs),
-        ]
-
-    model = open_model(compared.flight, needed_configurations)
-    steps = explain_ekf2_difference(compared, model, estimates.clock, corrected)
-    causes, trials = run_interventions(compared, estimates, model)
-    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
-        model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=steps, causes=causes, trials=trials)
-
-
-def diagnose_or_check_aids(
-    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
-) -> Analysis | AidsOnlyAnalysis:
-    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
-
-    Raises
-    ------
-    LogError, MissingDataError, SettingsError
-        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
-    """
-    flight = flight or read_flight(request, progress)
-    has_named_source = request.position_source is not None
-    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
-        return diagnose(request, progress, flight)
-    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
-    if isinstance(aids, Unavailable):
-        if flight.airborne == ():
-            raise MissingDataError(
-                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
-                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
-            )
-        raise MissingDataError(
-            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
-            f"checked: {aids.reason}",
-            no_position.remedy,
-        )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -180,7 +138,7 @@ def prepare_comparison(
     *,
     as_sent: bool = False,
 ) -> Comparison:
-    """Read a flight and select position source, time span and axes, without running KF.
+    """Choose position source, time span, axes and time offset of a flight, before KF runs.
 
     Arguments and errors are those of :func:`diagnose`.
     """
@@ -206,26 +164,53 @@ def prepare_comparison(
     return prepare(flight, request, as_sent=as_sent)
 
 
-def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
-    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+def intervene(
+    comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
+) -> Reruns:
+    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
+    progress("replaying EKF2")
+    corrected = corrected_settings(comparison, estimates.tuning)
+    model = open_model(
+        comparison.flight,
+        lambda inputs: [
+            *explanation_configurations(comparison, inputs, corrected),
+            *planned_configurations(comparison, estimates, inputs),
+        ],
+    )
+    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    trials = run_interventions(comparison, estimates, model)
+    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
+        model = replace(model, runs=(), intervals={})
+    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
+
+
+def diagnose_or_check_aids(
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> Analysis | AidsOnlyAnalysis:
+    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
 
     Raises
     ------
-    TrajectoryError, LogError, MissingDataError, SettingsError
-        A file cannot be read or lacks required data, or a setting is out of range.
+    LogError, MissingDataError, SettingsError
+        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
     """
-    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
-    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
-
-    for name in ("start_s", "end_s"):
-        if not math.isfinite(getattr(request, name) or 0.0):
-            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
-    progress(f"reading {display_name(Path(request.source))}")
-    system, reference = request.system, None
-    source = read_source(request.source, frame=request.frame, system=system)
-    if request.reference is not None:
-        reference = read_source(request.reference, default="truth", system=system).trajectory
-    return analyse(source, request, reference, progress)
+    flight = flight or read_flight(request, progress)
+    has_named_source = request.position_source is not None
+    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
+        return diagnose(request, progress, flight)
+    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    if isinstance(aids, Unavailable):
+        if flight.airborne == ():
+            raise MissingDataError(
+                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
+                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
+            )
+        raise MissingDataError(
+            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"checked: {aids.reason}",
+            no_position.remedy,
+        )
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
 
 
 def run_what_if(
@@ -259,7 +244,8 @@ def run_what_if(
     try:
         if model.agreement.good:
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
-            comparison = compare(prepare(flight, recordings))
+            prepared = prepare(flight, recordings)
+            comparison = compare(prepared, run_kf(prepared))
     except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
         if is_default_change:
             raise
@@ -270,7 +256,11 @@ def run_what_if(
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
             if not changes:
-                raise MissingDataError(_explain_missing_change(comparison, model))
+                name, noise = comparison.source.name, model.inputs.aid.noise
+                raise MissingDataError(
+                    f"{flight.log.name}: this log shows no better noise or delay for {name}.",
+                    f"Give a changed parameter, for example `changes` {noise}=0.1.",
+                )
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
     progress("replaying EKF2 with other parameters")
@@ -284,14 +274,23 @@ def run_what_if(
     )
 
 
-def _explain_missing_change(comparison: Comparison, model: Model) -> str:
-    """Format the error that a log does not determine maximum-likelihood parameters of EKF2."""
-    source = comparison.source
-    reason = f"noise and delay of {source.name} cannot be estimated from this log"
-    if source.origin.is_gnss or source.origin.may_drift:
-        reason = (
-            f"innovations do not show the slow errors of {source.name}, and the delay of "
-            f"{source.name} is correct or cannot be estimated"
-        )
-    name, noise = comparison.flight.log.name, model.inputs.aid.noise
-    return f"{name}: {reason}. Give a changed parameter, for example `changes` {noise}=0.1."
+def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
+    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read or lacks required data, or a setting is out of range.
+    """
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
+    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
+
+    for name in ("start_s", "end_s"):
+        if not math.isfinite(getattr(request, name) or 0.0):
+            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
+    progress(f"reading {display_name(Path(request.source))}")
+    system, reference = request.system, None
+    source = read_source(request.source, frame=request.frame, system=system)
+    if request.reference is not None:
+        reference = read_source(request.reference, default="truth", system=system).trajectory
+    return analyse(source, request, reference, progress)

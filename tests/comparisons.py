@@ -24,4 +24,8 @@ def prepare(
 
 
 def compare(flight: Flight, settings: Settings | None = None, **choices: Any) -> Comparison:
-    return comparison.compare(prepare(flight, settings, **choices))
+    return compare_prepared(prepare(flight, settings, **choices))
+
+
+def compare_prepared(prepared: Comparison) -> Comparison:
+    return comparison.compare(prepared, comparison.run_kf(prepared))

@@ -11,8 +11,8 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
+from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
@@ -124,13 +124,14 @@ def analysis(
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
         main=next(iter(axes), axis()), lines=tuple(each.axis for each in axes), segment=SEGMENT,
         settings=settings, notes=notes, missing=missing,
-        **{"tuning": {}, "difference_steps": {}, "causes": (), "trials": (), **usual, **parts},
+        **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
+        main_trials=[t for t in parts.get("trials", ()) if t.kinds],
     )  # fmt: skip
 
 
 def axis(name: str = "north", **parts: Any) -> Any:
     """Make the result of one axis; filters that are not given have no consistency test."""
-    usual = {"ekf2_innovations": NONE, "truth": NONE, "ekf2_state": NONE}
+    usual = dict.fromkeys(("ekf2_innovations", "ekf2_state", "ekf2_variance", "truth"), NONE)
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
@@ -153,12 +154,13 @@ def _with_truth(one: Any, truth: Any) -> Any:
 def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
     before: float = 9.0, explained_fraction: float = 1.0,
-) -> Intervention:  # fmt: skip
-    """Make the result of a re-run: the share of a statistic that a change explains."""
-    after = before ** (1.0 - explained_fraction)
-    return Intervention(
-        statistic=of, filter=owner, axis=axis, change=change, before=before, after=after,
-        explained_fraction=explained_fraction, is_sufficient=explained_fraction == 1.0,
+) -> Trial:  # fmt: skip
+    """Make a re-run whose change explains a fraction of the logarithm of a statistic."""
+    key, after = f"{of}_mean", before ** (1.0 - explained_fraction)
+    return Trial(
+        filter=owner, axis=axis, kinds=(), change=change, discrepancies=(of,),
+        before=RunStatistics(innovations=100, **{key: before}),
+        after=RunStatistics(innovations=100, **{key: after}),
     )  # fmt: skip
 
 

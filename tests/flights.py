@@ -348,10 +348,10 @@ def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysi
         tuning_by_axis=tune_by_axis(comparison),
         noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
-    causes, trials = run_interventions(comparison, estimates, missing)
+    trials = run_interventions(comparison, estimates, missing)
     return Analysis(
-        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, causes=causes,
-        trials=trials, events=collect_events(comparison), aids=evaluate_aids(comparison.flight),
+        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, trials=trials,
+        events=collect_events(comparison), aids=evaluate_aids(comparison.flight),
         loop=missing,
     )  # fmt: skip
 

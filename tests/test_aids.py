@@ -212,6 +212,7 @@ def test_height_error_below_three_rmse_in_a_gap_is_ignored(
     height_m.loc[25.0:26.0] = error_m
     down = SimpleNamespace(
         ekf2_state=height_m.to_frame("position_m"),
+        ekf2_variance=Unavailable("σ", "not logged", ""),
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})

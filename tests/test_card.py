@@ -53,14 +53,17 @@ CORRECTED = outcome(1.0, 1.1, 0.1)
 def trial(
     kind: str, after: RunStatistics, before: RunStatistics = FLOWN, owner: Any = "kf"
 ) -> Trial:
-    return Trial(filter=owner, kinds=(kind,), change=CHANGES[kind], before=before, after=after)
+    change = CHANGES[kind]
+    return Trial(
+        filter=owner, axis="aisle", kinds=(kind,), change=change, before=before, after=after
+    )
 
 
 def analysis(*trials: Trial) -> Any:
     source = SimpleNamespace(origin=RECEIVED)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
-        trials=trials, settings=Settings(), source=source, tuning={}, ekf2_model=model
+        main_trials=trials, settings=Settings(), source=source, tuning={}, ekf2_model=model
     )
 
 

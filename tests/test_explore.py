@@ -16,17 +16,16 @@ import numpy as np
 import pytest
 from browser import Browser, Elements
 from cli_tools import error_line, run_checked
-from comparisons import compare
+from comparisons import compare, compare_prepared
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.numbers import format_ratio
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
-from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.core.text import format_ratio
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
@@ -280,29 +279,14 @@ def test_explore_page_tooltips_show_values(page: Browser) -> None:
     )
     assert re.search(r"KF: *-?[\d.]+ m", tooltips.replace("EKF2", ""))
     assert re.search(r"EKF2: *-?[\d.]+ m", tooltips)
-    back = "Explore.then((e) => e.model('position').background_fill_color)"
-    light = ask(page, back)
+    colour = "Explore.then((e) => e.model('position').renderers.at(-1).glyph.line_color)"
+    light = ask(page, colour)
     page.scheme("dark")
     settle(page)
-    assert ask(page, back) != light
+    assert ask(page, colour) != light
     page.scheme("")
     settle(page)
-    assert ask(page, back) == light
-
-
-def test_explore_page_box_on_map_selects_time_span(page: Browser) -> None:
-    span = "document.getElementById('span').textContent"
-    whole = page.ask(span)
-    open_view(page, "step")
-    x, y, width, height = box(page, "plan")
-    # a box over one end of the track, which the vehicle leaves and reaches several times
-    corners = ((0.25, 0.05), (0.5, 0.2), (0.95, 0.35))
-    mouse(page, [(x + across * width, y + down * height) for across, down in corners])
-    low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
-    assert page.ask(span) != whole
-    # the vehicle is in the box from 22 s to 106 s
-    assert 15.0 < low < 30.0
-    assert 95.0 < high < 112.0
+    assert ask(page, colour) == light
 
 
 def test_explore_page_shows_markup_in_log_name_as_text(browser: Browser, tmp_path: Path) -> None:

@@ -30,13 +30,8 @@ TOLERANCE = 1e-9
 # Runs the engine on one flight with all settings
 SCRIPT = """(async () => {
   const arrays = await Engine.unpack(%(text)s, %(specs)s);
-  const flight = %(flight)s;
-  if (flight.imu.time !== undefined) flight.imu.time = arrays[flight.imu.time];
-  for (const axis of flight.axes) {
-    for (const name of ["time", "z", "integral"]) {
-      if (axis[name] !== undefined) axis[name] = arrays[axis[name]];
-    }
-  }
+  const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
+  const flight = JSON.parse(%(flight)s, withArrays);
   return %(tries)s.map(([at, settings]) => {
     const run = Engine.replay(flight, flight.axes[at], settings);
     const lists = (part) => Object.fromEntries(
@@ -83,7 +78,8 @@ def in_browser(
         for at, one in tries
     ]  # fmt: skip
     values = {
-        "text": packer.text(), "specs": packer.specs, "flight": flight, "tries": tries_for_page
+        "text": packer.text(), "specs": packer.specs, "flight": json.dumps(flight),
+        "tries": tries_for_page,
     }  # fmt: skip
     return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
 

@@ -1,9 +1,8 @@
-"""Explore page as a user sees it: layout, sentences, steps, tour, keyboard, accessibility."""
+"""Explore page as a user sees it: layout, sentences, steps, keyboard, accessibility."""
 
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from comparisons import compare_prepared
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.card.model import axis_fraction
 from px4fuse.card.verdicts import verdicts
-from px4fuse.comparison.comparison import compare as compare_prepared
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
-from px4fuse.filter.kalman import replay
-from px4fuse.filter.settings import Settings
 from px4fuse.report.card_html import card_of
 from px4fuse.request import ComparisonRequest
 
@@ -33,15 +31,6 @@ IN_VIEW = """(...names) => names.filter((name) => {
     && node.contains(document.elementFromPoint(x, y));
 })"""
 SLIDERS = ("#sigma-a", "#sigma-z", "#dt", "#clock-offset")
-STATIONS = ["Q almost zero", "R too small", "The ratio determines the track",
-            "The scale determines σ", "Time offset", "Outliers",
-            "Comparison with EKF2"]  # fmt: skip
-
-
-def nis_with(analysis: Analysis, settings: Settings) -> float:
-    """Return the mean NIS of KF along the main axis with other settings."""
-    updates = replay(analysis.main.axis, settings).updates
-    return float(np.mean(updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]))
 
 
 def put(page: Browser, **values: float) -> None:
@@ -54,16 +43,11 @@ def text(page: Browser, name: str) -> str:
     return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
 
 
-def key(page: Browser, name: str) -> None:
-    for kind in ("keyDown", "keyUp"):
-        page.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
-
-
 # ------------------------------------------------------------------ one screen
 
 
 def test_explore_page_on_desktop_shows_settings_card_and_plot(page: Browser) -> None:
-    wanted = [*SLIDERS, "#innovation", "#card h2", "#card figure", "#tabs", ".legend", "#flown"]
+    wanted = [*SLIDERS, "#innovation", "#card h2", "#card figure", "#views", ".legend", "#flown"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
 
@@ -97,38 +81,12 @@ def test_explore_page_on_phone_fits_card_and_plot_on_one_screen(
     show(browser, explored[0], width=390)
     browser.resize(390, 844)
     settle(browser)
-    sheet = ["#sigma-a", "#sigma-z", "#likely", "aside .tour-start", "#all"]
-    wanted = ["#card h2", "#card figure", "#tabs", ".legend", "#innovation", *sheet]
+    wanted = ["#card h2", "#card figure", "#views", ".legend", "#innovation", *SLIDERS[:2]]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
-    heights = "['likely', 'all'].map((id) => document.getElementById(id).offsetHeight)"
-    assert min(browser.ask(heights)) >= 44
-    # "All" opens the sheet with all settings
-    assert not browser.ask("document.getElementById('dt').checkVisibility()")
-    browser.click("#all")
+    browser.ask("document.querySelector('aside').scrollTo(0, 1e4)")
     settle(browser)
-    assert browser.ask("document.getElementById('dt').checkVisibility()")
-    assert browser.ask("document.getElementById('whatif').checkVisibility()")
-    browser.click("#all")
-    # the tabs select the plot
-    browser.ask("document.getElementById('tab-sigma_v').click()")
-    settle(browser)
-    assert browser.ask("document.querySelector('#sigma_v').checkVisibility()")
-    assert not browser.ask("document.querySelector('#innovation').checkVisibility()")
+    assert browser.ask(f"({IN_VIEW})('#ekf2-r')") == ["#ekf2-r"]
     assert browser.complaints() == []
-
-
-def test_explore_page_swipe_on_phone_opens_settings_sheet(
-    browser: Browser, explored: tuple[Path, Analysis]
-) -> None:
-    show(browser, explored[0], width=390)
-    browser.resize(390, 844)
-    settle(browser)
-    for start, end, is_open in ((700, 500, True), (500, 700, False)):
-        for kind, y in (("touchStart", start), ("touchMove", end), ("touchEnd", None)):
-            points = [] if y is None else [{"x": 100, "y": y}]
-            browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-        settle(browser)
-        assert browser.ask("document.querySelector('aside').matches('.open')") == is_open
 
 
 def test_explore_page_marks_innovations_outside_plot_at_edge(page: Browser) -> None:
@@ -316,75 +274,29 @@ def test_explore_page_space_key_starts_and_pauses_animation(page: Browser) -> No
     assert ask(page, steps) == at
 
 
-# ------------------------------------------------------------------ the tour
-
-
-def test_explore_page_tour_shows_results_of_the_flight(
-    page: Browser, explored: tuple[Path, Analysis]
-) -> None:
-    analysis = explored[1]
-    put(page, sigmaA=0.8, sigmaZ=0.2)
-    before = page.ask("location.hash")
-    page.click("header .tour-start")
-    settle(page)
-    assert page.ask("document.getElementById('tour-back').disabled")
-    shown = []
-    settings = "Explore.then((e) => [e.settings.sigmaA, e.settings.sigmaZ, e.settings.offset])"
-    for _ in STATIONS:
-        settle(page)
-        a, z, offset = ask(page, settings)
-        assert page.ask(f"({IN_VIEW})('#tour-title', '#card figure').length") == 2
-        shown.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
-        assert text(page, "tour-task").startswith("Task: ")
-        assert text(page, "tour-see").startswith("Result: ")
-        page.click("#tour-next")
-    settle(page)
-    assert [title for title, *_ in shown] == [f"{n + 1} of 7: {t}" for n, t in enumerate(STATIONS)]
-    assert page.ask("document.getElementById('tour').hidden")
-    assert page.ask("location.hash") == before
-    # the sentences contain the numbers of this flight
-    _, no_process_noise, a, z, offset = shown[0]
-    assert a == 0.002
-    change = re.search(r"innovation ÷ √S changes from ([\d.]+) to ([\d.]+)\.", no_process_noise)
-    with_clock = _shifted(analysis, offset)
-    assert change[2] == format_ratio(nis_with(with_clock, Settings(a, z)) ** 0.5)
-    scale = re.search(r"√S changes from ([\d.]+) to ([\d.]+): one third", shown[3][1])
-    assert float(scale[2]) == pytest.approx(float(scale[1]) / 3.0, rel=0.1)
-    assert shown[6][1].startswith("The RMS of innovation ÷ √S is 0.93 for EKF2 and ")
-
-
-def _shifted(analysis: Analysis, offset_s: float) -> Any:
-    """Compare the flight with corrected timestamps."""
-    request = ComparisonRequest(
-        log=str(Path("sample_logs") / analysis.flight.log.name), clock_offset_s=offset_s,
-        start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
-        heading_deg=analysis.main.axis.heading_deg,
-    )  # fmt: skip
-    return compare_prepared(prepare_comparison(request, flight=analysis.flight))
-
-
 # ------------------------------------------------------------------ accessibility
 
 
-def test_explore_page_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
-    page.ask("document.getElementById('tab-errors').focus()")
-    key(page, "ArrowRight")
+def press_right(page: Browser) -> None:
+    page.call(
+        "Input.dispatchKeyEvent", type="rawKeyDown", key="ArrowRight", code="ArrowRight",
+        windowsVirtualKeyCode=39,
+    )  # fmt: skip
+
+
+def test_explore_page_views_and_sliders_work_with_keyboard(page: Browser) -> None:
+    page.ask("document.querySelector('[name=view][value=errors]').focus()")
+    span = text(page, "span")
+    press_right(page)
     settle(page)
-    assert page.ask("document.activeElement.id") == "tab-sigma"
+    assert page.ask("document.activeElement.value") == "sigma"
     assert page.ask("document.querySelector('#sigma_p').checkVisibility()")
     assert not page.ask("document.querySelector('#innovation').checkVisibility()")
-    key(page, "End")
-    settle(page)
-    assert page.ask("document.querySelector('#view-map').checkVisibility()")
-    key(page, "ArrowRight")  # from the last tab to the first one
-    settle(page)
-    assert page.ask("document.activeElement.ariaSelected") == "true"
-    assert page.ask("document.activeElement.id") == "tab-errors"
+    assert text(page, "span") == span
     page.ask("document.getElementById('sigma-z').focus()")
     before = float(page.ask("document.getElementById('sigma-z-value').value"))
     for _ in range(5):
-        page.call("Input.dispatchKeyEvent", type="rawKeyDown", key="ArrowRight",
-                  code="ArrowRight", windowsVirtualKeyCode=39)  # fmt: skip
+        press_right(page)
     settle(page)
     assert float(page.ask("document.getElementById('sigma-z-value').value")) > before
 
@@ -398,9 +310,6 @@ def test_explore_page_has_no_serious_accessibility_violation(
     browser.scheme(scheme)
     browser.ask(axe())
     assert browser.ask("document.documentElement.scrollWidth") <= width
-    for view in ("errors", "track", "step", "map", "numbers"):
+    for view in ("errors", "track", "step", "map", "statistics"):
         open_view(browser, view)
         assert serious(browser) == [], view
-    browser.ask("document.querySelector('.tour-start').click()")
-    settle(browser)
-    assert serious(browser) == []

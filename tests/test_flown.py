@@ -44,7 +44,7 @@ class Flown(NamedTuple):
 FLIGHTS = {
     "v1.16.1_aisle_overconfident": Flown(
         (("ekf2_overconfident", "error",
-          {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)},
+          {"nis_mean": about(22.0, 0.2)},
           ("EKF2_EVP_NOISE to 0.098 m",)),
          ("ekf2_noise_too_small", "error",
           {"flown_m": about(0.02), "estimate_m": about(0.098), "factor": about(4.9)},
@@ -108,9 +108,7 @@ def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
         ]
         assert severity in (None, first.severity)
         assert {key: first.evidence[key] for key in evidence} == evidence
-    # both verdicts are certain at the logged 2 Hz, so a higher rate could not change them
     if name.endswith("hwlog"):
-        assert "source_rate_limited_by_logger" not in {item.id for item in found}
         assert {analysis.main.filters[owner].verdict for owner in FILTERS} == {"consistent"}
     if name.endswith("nominal"):
         assert {item.severity for item in found} <= {"note"}

@@ -11,14 +11,22 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    MIN_EXPLAINED_SHARE,
-    Intervention,
-    find_cause,
     planned_configurations,
     run_interventions,
 )
-from px4fuse.comparison.changes import CLOCK_OFFSET, FORWARD_BIAS, OUTLIERS, ROTATION
-from px4fuse.comparison.changes import RIGHT_BIAS as TO_RIGHT
+from px4fuse.comparison.trials import (
+    CLOCK_OFFSET,
+    FORWARD_BIAS,
+    OUTLIERS,
+    ROTATION,
+    RunStatistics,
+    Trial,
+    explained_fraction,
+    find_cause,
+    find_trials,
+    is_sufficient,
+)
+from px4fuse.comparison.trials import RIGHT_BIAS as TO_RIGHT
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
@@ -40,12 +48,12 @@ def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
     return explain(compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east")))
 
 
-def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
-    return find_cause(analysis.causes, owner, "aisle", of)
+def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Trial:
+    return find_cause(analysis.trials, owner, "aisle", of)
 
 
 def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
-    assert flown().causes == ()
+    assert not any(trial.discrepancies for trial in flown().trials)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +87,8 @@ def test_cause_found_for_simulated_fault_is_that_fault(
     assert found.change.keys() == change.keys()
     for name, (value, within) in change.items():
         assert found.change[name] == pytest.approx(value, abs=within)
-    assert found.is_complete_cause
+    distance = abs(explained_fraction(found, of) - 1.0)
+    assert is_sufficient(found, of) or (found.corrects_sensor and distance <= 0.25)
 
 
 def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
@@ -92,25 +101,25 @@ def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
     ]
     flight = replace(analysis.flight, imu=imu.assign(**without))
     again = compare(flight, analysis.settings).axes["aisle"].filters["kf"]
-    assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
+    assert found.after.nis_mean == pytest.approx(again.nis_mean, rel=1e-6)
 
 
 def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
-    assert found.explained_fraction > 0.5
-    assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
+    assert explained_fraction(found, "nis") > 0.5
+    assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").trials)
 
 
 def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
-    assert {row.filter for row in analysis.causes} == {"ekf2"}
+    assert {row.filter for row in analysis.trials if row.discrepancies} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
     assert again.change == pytest.approx(before.change, abs=0.01)
-    assert again.after == pytest.approx(before.after, rel=0.05)
+    assert again.after.nees_mean == pytest.approx(before.after.nees_mean, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -118,30 +127,31 @@ def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
 )
 def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     analysis = analysis()
-    found = find_cause(analysis.causes, "kf", "north", of)
+    found = find_cause(analysis.trials, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
 
     def statistic(of_comparison: Any) -> float:
         kf = of_comparison.axes["north"].filters["kf"]
         return float(kf.nis_mean if of == "nis" else kf.truth.nees_position_mean)
 
-    assert found.before == pytest.approx(statistic(analysis), rel=1e-9)
+    before, after = found.before.value(of), found.after.value(of)
+    assert before == pytest.approx(statistic(analysis), rel=1e-9)
     # the re-run's NEES is at KF's steps, that of the comparison at EKF2's sample times
-    assert found.after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
-    assert found.explained_fraction == pytest.approx(
-        1.0 - np.log(found.after) / np.log(found.before)
-    )
+    assert after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
+    assert explained_fraction(found, of) == pytest.approx(1.0 - np.log(after) / np.log(before))
 
 
 def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
-    found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
+    found = [find_cause(analysis.trials, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
     replays = what_if(replace(model, runs=()), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
-        assert one.before == pytest.approx(replays.replayed.axes[axis].nis_mean, rel=1e-9)
-        assert one.before == pytest.approx(analysis.axes[axis].filters["ekf2"].nis_mean, rel=0.1)
-        assert one.after == pytest.approx(replays.whatif[0].axes[axis].nis_mean, rel=1e-9)
+        nis_before = pytest.approx(one.before.nis_mean, rel=0.1)  # of the log
+        assert replays.replayed.axes[axis].nis_mean == nis_before
+        assert analysis.axes[axis].filters["ekf2"].nis_mean == nis_before
+        nis_after = replays.whatif[0].axes[axis].nis_mean
+        assert one.after.nis_mean == pytest.approx(nis_after, rel=1e-9)
     # the configuration was planned with EKF2 as flown; other positions give another replay
     assert FilterConfiguration({**model.inputs.settings, **change}) in planned_configurations(
         analysis, analysis, model.inputs
@@ -158,20 +168,16 @@ rms_difference = attrgetter("main.difference.position_rms_m")
 def test_cause_states_position_difference_before_and_after() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
-    (row,) = [one for one in kf_case.causes if (one.statistic, one.axis) == ("difference", "aisle")]
-    assert (row.before, row.after) == pytest.approx(
+    row = cause(kf_case, "kf")
+    assert (row.before.difference_rms_m, row.after.difference_rms_m) == pytest.approx(
         (rms_difference(kf_case), rms_difference(right))
     )
-    assert row.change == cause(kf_case, "kf").change
-    assert row.explained_fraction == pytest.approx(1.0 - (row.after / row.before) ** 2)
-    assert row.explained_fraction > 0.8
+    assert explained_fraction(row, "difference") > 0.8
     # corrected EKF2 differs from KF as much as EKF2 in the same flight without the fault
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
-    (row,) = [
-        one for one in ekf2_case.causes if (one.statistic, one.axis) == ("difference", "aisle")
-    ]
-    assert (row.before, row.after) == pytest.approx(
+    row = cause(ekf2_case, "ekf2")
+    assert (row.before.difference_rms_m, row.after.difference_rms_m) == pytest.approx(
         (rms_difference(ekf2_case), rms_difference(right)), rel=0.1
     )
 
@@ -179,10 +185,9 @@ def test_cause_states_position_difference_before_and_after() -> None:
 def test_filter_rerun_excludes_outliers_at_shifted_timestamps() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
-    rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
+    rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
     alone = next(one for one in rows if one.change == {OUTLIERS: count})
-    assert alone.statistic == "nis"
-    assert alone.is_sufficient
+    assert is_sufficient(alone, "nis")
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_settings(model, [{}], out.outlier_time_s)
     (late,) = replay_settings(
@@ -200,19 +205,20 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
-    rows, _ = run_interventions(analysis, analysis, model)
-    tried = [one.change for one in rows if (one.axis, one.statistic) == ("aisle", "nis")]
+    rows = run_interventions(analysis, analysis, model)
+    tried = [one.change for one in find_trials(rows, "ekf2", "aisle")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
 def test_cause_explains_50_to_150_percent_of_inconsistency() -> None:
-    def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
-        return Intervention(
-            statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,
-            after=9.0 ** (1.0 - explains), explained_fraction=explains, is_sufficient=into,
+    def one(change: Any, explains: float, *, into: bool = False) -> Trial:
+        after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
+        return Trial(
+            filter="kf", axis="aisle", kinds=(), change=change, discrepancies=("nis",),
+            before=RunStatistics(nis_mean=9.0), after=after,
         )  # fmt: skip
 
-    for explains in (MIN_EXPLAINED_SHARE - 0.01, 1.51, -1.0):
+    for explains in (0.49, 1.51, -1.0):
         assert find_cause([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
     assert (
@@ -238,8 +244,8 @@ def test_filter_rerun_without_required_data_is_skipped() -> None:
     missing = Unavailable("it", "not known", "None.")
 
     def tried(model: Any = analysis.ekf2_model, **parts: Any) -> set[tuple[str, str]]:
-        rows, _ = run_interventions(analysis, replace(analysis, **parts), model)
-        return {(row.filter, name) for row in rows for name in row.change}
+        rows = run_interventions(analysis, replace(analysis, **parts), model)
+        return {(row.filter, name) for row in rows if row.discrepancies for name in row.change}
 
     assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}
     assert tried(model=missing) == {("kf", "sigma_z_m"), ("kf", OUTLIERS)}

@@ -50,8 +50,10 @@ def trial(
     change: dict[str, float], after: float = 1.0, owner: Any = "kf", kind: str = "noises"
 ) -> Trial:
     """Make a re-run that changes the mean NIS from 16 to ``after``."""
-    return Trial(filter=owner, kinds=(kind,), change=change, before=RunStatistics(nis_mean=16.0),
-                 after=RunStatistics(nis_mean=after))  # fmt: skip
+    before, after_change = RunStatistics(nis_mean=16.0), RunStatistics(nis_mean=after)
+    return Trial(
+        filter=owner, axis="north", kinds=(kind,), change=change, before=before, after=after_change
+    )
 
 
 # ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
@@ -218,7 +220,7 @@ def test_near_zero_process_noise_finding_states_response_time() -> None:
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A (--sigma-a)."
     assert finding.title == "SIGMA_A 1 m/s² makes Q almost zero: KF ignores new positions"
-    assert "5.0 % between updates, and the gain falls to 0.05. KF needs 5 s" in finding.message
+    assert "so the gain falls to 0.05. KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
     one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)),
                    trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
@@ -335,7 +337,7 @@ def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
     one = axis("north", **{owner: statement(9.0, "overconfident")})
-    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), causes=causes))
+    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), trials=causes))
     assert finding.remedy.endswith(action)
     assert finding.evidence["cause"] == kind
 
@@ -343,15 +345,15 @@ def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind
 def test_filter_rerun_without_improvement_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
-        one = analysis(axes=(kf(9.0),), causes=(tried("kf", change),), tuning=tuned(),
-                       trials=(trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
+        one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
+            tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
 
 def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
-    one = analysis(axes=(kf(9.0),), causes=causes, tuning=tuned())
+    one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.NOT_EXPLAINED)
     unknown = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),)))
@@ -359,8 +361,9 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
 
 
 def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
-    contradicted = replace(tried("kf", {"sigma_z_m": 0.5}, before=0.2), contradicts_truth=True)
-    one = analysis(axes=(kf(0.2),), causes=(contradicted,))
+    contradicted = tried("kf", {"sigma_z_m": 0.5}, before=0.2)
+    contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
+    one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
@@ -418,7 +421,7 @@ def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
     estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
     outcome = RunStatistics(nis_mean=16.0 if estimate_m > flown_m else 0.1)
     change = {aid.noise: estimate_m}
-    rerun = Trial(filter="ekf2", kinds=("noise",), change=change, before=outcome,
+    rerun = Trial(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
                   after=RunStatistics(nis_mean=1.0))  # fmt: skip
     model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
     result = axis("north", rejected_fraction=rejected)

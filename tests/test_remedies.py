@@ -98,7 +98,9 @@ def test_drift_of_vio_is_the_first_finding(seed, mistakes) -> None:
 
 def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises") -> Trial:
     before = RunStatistics(nis_mean=16.0, nees_mean=9.0, position_rmse_m=0.5)
-    return Trial(filter="kf", kinds=(kind,), change={change: 1.0}, before=before, after=after)
+    return Trial(
+        filter="kf", axis="aisle", kinds=(kind,), change={change: 1.0}, before=before, after=after
+    )
 
 
 @pytest.mark.parametrize(
@@ -147,8 +149,8 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
         sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
     changed = replace(analysis, clock=clock)
-    causes, trials = run_interventions(changed, changed, changed.ekf2_model)
-    return replace(changed, causes=causes, trials=trials)
+    trials = run_interventions(changed, changed, changed.ekf2_model)
+    return replace(changed, trials=trials)
 
 
 def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> None:

@@ -11,6 +11,7 @@ from exchange import replace
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.trials import contradicts_truth
 from px4fuse.diagnose import explain
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
@@ -152,10 +153,12 @@ def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
     analysis = analysed(model, truth_for=sigma_z_m)
     tried = [
-        each for each in analysis.causes if "sigma_z_m" in each.change and each.statistic == "nis"
+        each
+        for each in analysis.trials
+        if "sigma_z_m" in each.change and "nis" in each.discrepancies
     ]
     assert {each.axis for each in tried} == {"north", "east"}
-    assert all(each.contradicts_truth == contradicts for each in tried)
+    assert all(contradicts_truth(each, "nis") == contradicts for each in tried)
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
     if contradicts:

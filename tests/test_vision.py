@@ -562,5 +562,5 @@ def test_kf_ekf2_explanation_on_gnss_flight_includes_vision() -> None:
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"
-    assert {cause.filter for cause in analysis.causes} == {"kf"}
+    assert {trial.filter for trial in analysis.trials} == {"kf"}
     assert not [item for item in find(analysis) if "EKF2_GPS_P_NOISE" in item.remedy]

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import pytest
 from cli_tools import contents, error_line, run, run_checked, run_main
+from comparisons import compare_prepared
 from conftest import SAMPLES
 from exchange import replace
 from ulog_tools import make_log
 
-from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.core import writing
 from px4fuse.core.writing import STANDARD_OUTPUT, write_all
 from px4fuse.diagnose import prepare_comparison

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -35,8 +34,7 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     Parameters
     ----------
     scheduler : str, optional
-        Address of a running Dask scheduler; default: the Dask client of this Python session, if
-        there is one, else this computer.
+        Address of a running Dask scheduler; default: this computer.
 
     Raises
     ------
@@ -45,10 +43,7 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
         has another version of px4fuse.
     """
     if scheduler is None:
-        client = _session_client()
-        if client is not None:
-            _check_workers(client)
-        yield client
+        yield None
         return
     try:
         from distributed import Client  # noqa: PLC0415 - of the extra `batch`
@@ -69,18 +64,6 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
         _check_workers(client)
         yield client
-
-
-def _session_client() -> Client | None:
-    if "distributed" not in sys.modules:
-        return None
-    from distributed import default_client  # noqa: PLC0415
-
-    try:
-        client: Client = default_client()
-    except ValueError:  # this Python session has no Dask client
-        return None
-    return client
 
 
 def _check_workers(client: Client) -> None:

@@ -23,8 +23,10 @@ MEASURES = [
     for row in read_rows("measures.csv")
     for name, label in (FILTER_LABELS.items() if "FILTER" in row["path"] else [("", "")])
 ]
-# Minimum differences that px4fuse diff lists: relative to the number, and in the number's unit
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
+# Minimum relative difference of two numbers that px4fuse diff lists
+RELATIVE_TOLERANCE = 0.01
+# Minimum difference of two numbers, in their unit, that px4fuse diff lists
+ABSOLUTE_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)

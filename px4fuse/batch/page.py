@@ -10,14 +10,13 @@ import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
 from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
-from px4fuse.card.numbers import format_metres, format_ratio
-from px4fuse.core.text import format_number, join_first
+from px4fuse.core.text import format_metres, format_number, format_ratio, join_first
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import clean, load_template, local_link
-from px4fuse.report.card_html import MARK_PATHS, SEVERITY_SIGNS, band_limits
-from px4fuse.report.card_text import FILTER_NAMES, MARKS
+from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
 # verdicts of the diagnosis (Card)
@@ -81,23 +80,13 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         Name and version of px4fuse.
     """
     logs = sort_logs(logs_of(table))
-    names = short_names(logs)
     rows = [
-        Row(_log_cells(log, names), tuple(log["tags"]), _log_details(log), _side_sections(log))
+        Row(_log_cells(log), tuple(log["tags"]), _log_details(log), _side_sections(log))
         for log in logs
     ]
-    counts = Counter(log["severity"] for log in logs)
-    parts = (
-        ("error", "with an error"),
-        ("warning", "with a warning"),
-        ("clean", "without a fault"),
-        ("refused", "not analysed"),
-    )
-    count_text = ", ".join(f"{counts[name]} {text}" for name, text in parts if counts[name])
     return frame.page(
         title=title,
-        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}"
-        f"{f': {count_text}' if count_text else ''}. Compared with {made_with}.",
+        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}. Compared with {made_with}.",
         html_above=load_template("batch/axis.html").render(limits=band_limits()),
         noun=("log", "logs"),
         columns=(
@@ -106,7 +95,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{FILTER_NAMES[filter_name]} {MARKS[reference_name]}",
+                    f"{filter_name.upper()} {MARKS[reference_name]}",
                     "ratio",
                     visible_from="tablet",
                 )
@@ -130,9 +119,8 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _log_cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
+def _log_cells(log: Log) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
-    vehicle = log.get("vehicle", "")
     severity, action = log["severity"], log.get("action", "")
     style = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
@@ -145,7 +133,7 @@ def _log_cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
         ),
         _value_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
-        frame.text_cell(names.get(vehicle, str(vehicle))),
+        frame.text_cell(log.get("vehicle", "")),
         frame.text_cell(log.get("firmware", "")),
         _value_cell(log.get("sigma_z_m"), format_number),
         _value_cell(log.get("clock_offset_s"), format_number),
@@ -294,10 +282,3 @@ def _log_tags(log: Log) -> dict[str, str]:
     return tags | {
         f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
     }
-
-
-def short_names(logs: Sequence[Log]) -> dict[str, str]:
-    """Map long ids of flight controllers (above 20 characters) to their last 8, if all differ."""
-    long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
-    short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
-    return short_ids if len(set(short_ids.values())) == len(short_ids) else {}

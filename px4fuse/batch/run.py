@@ -106,8 +106,6 @@ def run_batch(
 ) -> pd.DataFrame:
     """Compare many logs as :func:`px4fuse.compare` does, on this computer or a Dask cluster.
 
-    If the Python session has a Dask client (``distributed.Client``), its cluster is used.
-
     Parameters
     ----------
     paths : str, Path or iterable of them

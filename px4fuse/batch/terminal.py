@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_of, sort_logs
 from px4fuse.batch.rows import FAILED
-from px4fuse.card.numbers import format_ratio
-from px4fuse.core.text import format_number
-from px4fuse.report.card_html import SEVERITY_SIGNS
+from px4fuse.core.text import format_number, format_ratio
+from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
@@ -17,8 +16,10 @@ from px4fuse.results.contract import ChangeResults, Interval
 if TYPE_CHECKING:
     from px4fuse.batch.run import BatchResult
 
-# Maximum numbers of reasons for missing results, and of logs, that the summary lists
-MAX_LISTED_REASONS, MAX_LISTED_LOGS = 8, 40
+# Maximum number of reasons for missing results that the summary lists
+MAX_LISTED_REASONS = 8
+# Maximum number of logs that the summary lists
+MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")

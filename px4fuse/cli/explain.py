@@ -39,11 +39,10 @@ def _list_page() -> Page:
 
 def _finding_page(finding_id: str) -> Page:
     from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids
-    from px4fuse.findings.model import CATALOGUE, RENAMED_IDS, load_examples
+    from px4fuse.findings.model import CATALOGUE, load_examples
     from px4fuse.report.page import Page
 
     name = finding_id.lower().replace("-", "_")
-    name = RENAMED_IDS.get(name, name)
     if name not in CATALOGUE:
         raise SettingsError(
             f"{finding_id!r} is not a finding",

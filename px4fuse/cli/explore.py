@@ -20,7 +20,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
     LOG is a PX4 ULog or a MAVLink recording; without LOG, the sample flight is used. Sliders for
     SIGMA_A, SIGMA_Z, DT and the clock offset re-run KF in the browser. Plots show innovations, σ
-    and errors. A step view shows each prediction and update, and a tour explains the main effects.
+    and errors. A step view shows each prediction and update.
     The page is one file and needs no network.
     """
     from px4fuse.diagnose import diagnose

@@ -3,24 +3,32 @@
 Changes of EKF2 need its ``inputs``; without inputs, the changes are those of KF.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.remedy import ml_delay_change, noise_change
-from px4fuse.comparison.trials import Change, Statistic
+from px4fuse.comparison.trials import (
+    ACCOMPANYING_CHANGES,
+    CLOCK_OFFSET,
+    DISCREPANCIES,
+    FORWARD_BIAS,
+    OUTLIERS,
+    RIGHT_BIAS,
+    ROTATION,
+    Change,
+    Statistic,
+)
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
+from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
-CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
-# Changes that correct a sensor fault; they are preferred to changes of settings
-SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
 # Minimum SIGMA_Z (m) of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
@@ -34,14 +42,12 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
-# Parameters that a change of another parameter requires; they do not count as separate changes
-ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of the estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger
-# EKF2_ACC_NOISE: SIGMA_A also covers tilt error and bias
+# Minimum ratio of estimated SIGMA_A and EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
+# SIGMA_A also covers tilt error and bias
 VIBRATION_FACTOR = 3.0
-# EKF2 parameters that are re-run with PX4's default value if another value was flown
+# EKF2 parameters that are re-run with PX4's default if another value was flown
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -50,7 +56,7 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum misalignment in standard deviations of its estimate for a re-run with rotated positions
+# Minimum misalignment in σ of its estimate for a re-run with rotated positions
 HEADING_SIGMAS = 3.0
 
 
@@ -96,19 +102,20 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to be re-run along the main axis, each once.
+    """Return the changes to re-run along the main axis.
 
     For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
     the position timestamps.
     """
-    changes = list[Change]()
-    for statistic in ("nis", "nees"):
-        found = candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
-        changes += [change for change in found if change not in changes]
+    changes = unique_changes(
+        change
+        for statistic in DISCREPANCIES[::-1]
+        for change in candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
+    )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
         offsets = _time_offset(comparison, estimates, inputs) if has_delay else []
-        return [*changes, *(offset for offset in offsets if offset not in changes)]
+        return unique_changes([*changes, *offsets])
     noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noises) > 1:
         changes.append({name: value for change in noises for name, value in change.items()})
@@ -116,8 +123,12 @@ def main_axis_changes(
     return [*changes, *([defaults] if defaults and noises else [])]
 
 
+def unique_changes(changes: Iterable[Change]) -> list[Change]:
+    return list({frozenset(change.items()): change for change in changes}.values())
+
+
 def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
-    """Return the kind of each part of a change, see :attr:`.trials.Trial.kinds`."""
+    """Return the kinds of a change, see :attr:`.trials.Trial.kinds`."""
     if inputs is None and change == default_settings(comparison):
         return ("defaults",)
     kinds: dict[str, str] = {}
@@ -131,7 +142,7 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 
 def default_settings(comparison: Comparison) -> Change:
-    """Return the default of each noise of KF that was set; GNSS uses SIGMA_Z from EKF2."""
+    """Return the default noises of KF, where the user chose others."""
     chosen, default = comparison.settings, Settings()
     names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -142,14 +153,14 @@ def default_settings(comparison: Comparison) -> Change:
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the noise estimate of an axis; of both horizontal axes together if available."""
+    """Return the noise estimate of an axis; north and east share one estimate."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _time_offset(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return a change of the time offset, if its part not yet applied is significant."""
+    """Return the estimated time offset, if the part that is not yet applied is significant."""
     clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return []
@@ -160,7 +171,7 @@ def _time_offset(
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
-    """Return SIGMA_A and SIGMA_Z estimates whose 95 % interval excludes the setting."""
+    """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from the setting."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
         chosen_sigma = getattr(settings, name)
@@ -178,7 +189,7 @@ def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    """Return the removal of the accelerometer biases, if they are significant."""
+    """Return the significant accelerometer biases, to be removed."""
     fit = estimates.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or not fit.has_bias:
         return []
@@ -187,7 +198,7 @@ def _without_bias(estimates: Estimates) -> list[Change]:
 
 
 def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
-    """Return the estimated position noise if its 95 % interval excludes EKF2's value."""
+    """Return the estimated position noise, if it differs significantly from EKF2's."""
     aid, flown, noise = inputs.aid, inputs.settings, tuned.sigma_z
     uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
     reported_m2 = inputs.received.variance_m2[:, :2] * uses_reported
@@ -201,7 +212,7 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> li
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
-    """Return PX4's default of the gate, if it is wider, and of each other changed parameter."""
+    """Return PX4's default of each changed noise, and of a gate that is too small."""
     gate, flown = inputs.aid.gate, inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
     return [
@@ -214,7 +225,7 @@ def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
 
 
 def _vibration_noise(settings: Settings, inputs: Inputs, tuned: AxisTuning) -> list[Change]:
-    """Return the maximum-likelihood process noise for vibration, within PX4's range.
+    """Return a larger EKF2_ACC_NOISE that covers the vibration, within PX4's range.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds
     SIGMA_A² · DT² in each DT.

@@ -30,8 +30,16 @@ VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 Frame = pd.DataFrame | Unavailable
 
 
-def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
-    """Run KF on a prepared flight, and compare it with EKF2 and with ground truth if available."""
+def run_kf(
+    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Replay]:
+    """Run KF along each axis of a prepared flight."""
+    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
+    return {line.name: replay(line, prepared.settings) for line in prepared.lines}
+
+
+def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
+    """Compare KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -40,11 +48,7 @@ def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: No
         if not state.equals(ekf2.state):
             # without its resets, the state is in another frame than positions at the fusion horizon
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
-    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
-    axes = {
-        line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
-        for line in prepared.lines
-    }
+    axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
         "kf": {name: axis.replay.updates for name, axis in axes.items()},
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
@@ -105,7 +109,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, Frame]:
-    """Project EKF2's state and variances and the ground truth onto an axis, in a segment."""
+    """Project EKF2's state and variances, and the ground truth, onto an axis."""
     state: Frame
     variance: Frame
     if isinstance(ekf2, Unavailable):
@@ -113,8 +117,8 @@ def project_tracks(
     else:
         state = projection.project(ekf2.state, axis, segment)
         variance = projection.project_variance(ekf2, axis, segment)
-    true = projection.project_truth(truth, axis, segment)
-    return {"ekf2_state": state, "ekf2_variance": variance, "truth": true}
+    projected_truth = projection.project_truth(truth, axis, segment)
+    return {"ekf2_state": state, "ekf2_variance": variance, "truth": projected_truth}
 
 
 def _summarise_filter(
@@ -175,12 +179,12 @@ def _rmse(error: Array) -> float:
 def kf_error_statistics(
     kf_run: Replay, truth: Frame, ekf2_state: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute KF's errors against ground truth at EKF2's sample times, else at each prediction."""
+    """Compute the errors of KF against ground truth, at EKF2's sample times if available."""
     return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
 
 
 def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times, else at each prediction."""
+    """Return state and variances of KF, at EKF2's sample times if available."""
     frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
     return kf_state_and_variance(kf_run, frame.index.to_numpy())
 
@@ -197,7 +201,7 @@ def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, p
 def error_statistics(
     state: Frame, variance: Frame, truth: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute errors of a filter against ground truth along one axis, and its mean NEES.
+    """Compute the errors of a filter against ground truth along one axis.
 
     Variances are interpolated to the times of ``state``, because PX4 logs those of EKF2 at a tenth
     of the rate.
@@ -240,7 +244,7 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Return the reported σ, interpolated to other times (s); NaN where unknown."""
+    """Interpolate the reported σ to other times (s); NaN if unknown."""
     known = _known_values(variance, column)
     if known.empty:
         return np.full(len(time_s), np.nan)
@@ -281,7 +285,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
 def normalised_position_errors(
     result: AxisComparison, owner: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return times (s), and position errors against ground truth divided by the reported σ."""
+    """Return times (s) and position errors divided by the reported σ."""
     errors = position_errors(result, owner)
     if isinstance(errors, Unavailable):
         return errors

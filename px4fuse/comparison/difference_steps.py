@@ -30,17 +30,18 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference of the position RMSEs of KF and EKF2 that texts call equal
+# Maximum relative difference of the position RMSEs of KF and EKF2 that sentences call the same
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference for the second largest step to be mentioned
+# Minimum fraction of the mean square difference for a sentence on the second largest step
 MIN_NOTABLE_SHARE = 0.05
 # Minimum ratio of a KF noise setting and its estimate for the setting to be corrected first
 MIN_SETTING_RATIO = 4.0
-# Minimum change of the KF position (m) by an EKF2 property for which KF and EKF2 count as different
+# Minimum change (m) of the position for an EKF2 property to be listed as a step
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum difference KF - EKF2 outside the replayed times that is reported: in m, and as a factor on
-# the largest difference in the replayed times
-MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO = 0.5, 3.0
+# Minimum difference KF - EKF2 (m) outside the replayed times for a sentence
+MIN_UNREPLAYED_M = 0.5
+# Minimum ratio of the largest differences KF - EKF2 outside and inside the replayed times
+MIN_UNREPLAYED_RATIO = 3.0
 
 
 def explain_ekf2_difference(
@@ -100,10 +101,10 @@ def explain_ekf2_difference(
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return the estimate of each noise of KF that the user set far from its estimate.
+    """Return estimates for the noise settings of KF that are far from their estimate.
 
-    A wrong setting is a separate cause of the difference. Without its correction, each step alone
-    would remove nearly the whole difference.
+    A wrong setting is a separate cause. Without its correction, each step alone would
+    remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -131,7 +132,7 @@ def explanation_configurations(
 
 
 def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
-    """Return KF's corrected settings; no time offset if EKF2 fused another source."""
+    """Return the corrected settings of KF, without time offset if EKF2 fused another source."""
     settings = _with_changes(comparison.settings, corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
@@ -175,17 +176,22 @@ def add_sentences(
         f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name}. "
         f"{reasons[first.name]}."
     )
-    sentences = [
-        *_corrected_sentences(explanation),
-        f"{cause} {_moment_text(first)} This step is {_format_share(first, explanation)}.",
-    ]
+    sentences = []
+    if explanation.corrected:
+        settings = " and ".join(
+            f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
+        )
+        sentences.append(
+            f"KF was run with {settings} for this explanation: the wrong setting is corrected "
+            "first, and the steps explain the remaining difference KF - EKF2."
+        )
+    sentences.append(f"{cause} {_effect_text(first, explanation)}")
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
-            f"Second largest contribution: {second.name} ({_format_share(second, explanation)}). "
-            f"{reasons[second.name]}. "
-            f"{_moment_text(second)}"
+            f"Second largest contribution: {second.name}. {reasons[second.name]}. "
+            f"{_effect_text(second, explanation)}"
         )
-    sentences += [_velocity_sentence(explanation), *_truth_sentences(explanation)]
+    sentences += [_unexplained_sentence(explanation), *_truth_sentences(explanation)]
     min_reported_m = max(
         MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m)))
     )
@@ -198,39 +204,25 @@ def add_sentences(
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
 
 
-def _corrected_sentences(explanation: DifferenceExplanation) -> list[str]:
-    if not explanation.corrected:
-        return []
-    texts = (
-        f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
-    )
-    return [
-        f"KF was run with {' and '.join(texts)} for this explanation: the wrong setting is "
-        "corrected first, and the steps explain the remaining difference KF - EKF2."
-    ]
-
-
-def _format_share(step: Step, explanation: DifferenceExplanation) -> str:
+def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
     share = step.position_mean_square_m2 / explanation.position_mean_square_m2
+    share_text = f"{100 * share:.0f} % of the mean square difference"
     if share > 1.0:  # the fractions of all steps add up to 100 %, so other steps are negative
-        return "more than the whole mean square difference; other steps reduce it"
-    return f"{100 * share:.0f} % of the mean square difference"
-
-
-def _moment_text(step: Step) -> str:
-    return f"Largest position effect: {step.position_moved_m:.2f} m at {step.moved_at_s:.1f} s."
+        share_text = "more than the whole mean square difference; other steps reduce it"
+    return (
+        f"Largest position effect: {step.position_moved_m:.2f} m at {step.moved_at_s:.1f} s. This "
+        f"step is {share_text}."
+    )
 
 
 def _rejection_text(explanation: DifferenceExplanation) -> str:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""
-    samples = (
-        f"{rejection_run.samples} samples in a row" if rejection_run.samples > 1 else "a sample"
-    )
+    samples = f"{rejection_run.samples} sample{'s' if rejection_run.samples > 1 else ''}"
     return (
-        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} and drifted "
-        f"{rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
+        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} in a row "
+        f"and drifted {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
     )
 
 
@@ -295,29 +287,20 @@ def _step_reasons(
     }
 
 
-def _velocity_sentence(explanation: DifferenceExplanation) -> str:
+def _unexplained_sentence(explanation: DifferenceExplanation) -> str:
     position, velocity = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
-    first = max(explanation.steps, key=lambda step: step.velocity_mean_square_m2_s2)
-    share = first.velocity_mean_square_m2_s2 / velocity
-    # a step with a fraction above 1 compensates an earlier step: it is not the largest contribution
-    largest = f" Largest cause of the velocity difference: {first.name} ({100 * share:.0f} %)."
-    velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / velocity
+    position_share, velocity_share = (
+        f"{100 * min(share, 1.0):.1f} %"
+        for share in (
+            explanation.unexplained_fraction,
+            explanation.unexplained_velocity_mean_square_m2_s2 / velocity,
+        )
+    )
     return (
         f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(velocity):.3f} m/s.{largest if share <= 1.0 else ''} Fraction of the mean "
-        "square that the replay does not explain: "
-        f"{_unexplained_text(explanation.unexplained_fraction)} in position, "
-        f"{_unexplained_text(velocity_left_share)} in velocity."
+        f"{np.sqrt(velocity):.3f} m/s. Fraction of the mean square that the replay does not "
+        f"explain: {position_share} in position, {velocity_share} in velocity."
     )
-
-
-def _unexplained_text(share: float) -> str:
-    """Format the fraction of a mean square that the replay does not explain; "all" above 1.
-
-    >>> _unexplained_text(0.0071), _unexplained_text(4.2)
-    ('0.7 %', 'all')
-    """
-    return f"{100 * share:.1f} %" if share <= 1.0 else "all"
 
 
 def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:

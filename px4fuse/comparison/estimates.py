@@ -33,14 +33,14 @@ from px4fuse.flight.model import Flight, Unavailable
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and a
-# lower telemetry rate skips samples
+# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
+# slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Ratio of measured to nominal IMU rate that is sufficient: measured rates are up to 2 % lower
+# Minimum ratio of measured and nominal IMU rate: measured rates are up to 2 % lower
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum change (s) of the time offset in flight; drift of the source may cause a smaller one
+# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
 MIN_CHANGE_S = 0.10
 # Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2
@@ -87,7 +87,7 @@ class Estimates:
 
 
 def ignore_progress(_: str) -> None:
-    """Ignore progress messages."""
+    """Do nothing with the name of a step."""
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
@@ -102,7 +102,7 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
-    """Estimate the noises first, because all other estimates depend on them."""
+    """Estimate noises, time offset, frame misalignment and errors of the source."""
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -125,7 +125,7 @@ def tuned(
     progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Estimate the noises along the axes, without IMU biases if the IMU rate is too low.
+    """Estimate the noises along the axes.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def estimate_noises_and_clock(
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Estimate the noises, and the remaining time offset between positions and IMU.
+    """Estimate the noises and the time offset between positions and IMU.
 
     Parameters are those of :func:`tuned`.
     """
@@ -183,7 +183,7 @@ def estimate_frame_rotation(
     clock: ClockOffset | Unavailable,
     progress: Progress = ignore_progress,
 ) -> HeadingError | Unavailable:
-    """Estimate the frame misalignment in yaw with the estimated noise and time offset."""
+    """Estimate the yaw misalignment of the position frame."""
     progress("heading")
     axis_tuning, sigma_z_m = first_axis_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
     if axis_tuning is not None:
@@ -208,7 +208,7 @@ def _fit_source_errors(
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
-    """Fit biases, scale and jumps, then the time correlation that remains without the jumps."""
+    """Fit biases, scale and jumps, and then the time correlation of the remaining errors."""
     horizontal = _horizontal_axes(comparison, tuning)
     if isinstance(horizontal, Unavailable):
         return horizontal, horizontal, horizontal
@@ -268,7 +268,7 @@ def _horizontal_axes(
 
 
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
-    """Return Unavailable if the IMU rate is too low to estimate a time offset, else None.
+    """Return the reason if the IMU rate is too low to estimate a time offset.
 
     A sample in a ULog is the mean over its interval. A telemetry message contains only the newest
     of several samples, minus EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the
@@ -282,22 +282,18 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
     if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
         return None
-    rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
-    rate_note = f"the IMU was logged at {rate_text}"
+    rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        rate_note = (
-            f"the IMU was received over telemetry at {rate_text}, decimated from a higher rate"
-        )
+        rate_note = f"telemetry contains only a part of the IMU samples ({rate_hz:.3g} Hz)"
         remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of this flight as argument LOG."
-    reason = f"{rate_note}; at least {needed_hz:g} Hz are needed"
-    return Unavailable("clock offset", reason, remedy)
+    return Unavailable("clock offset", f"{rate_note}; at least {needed_hz:g} Hz are needed", remedy)
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
-    """Widen the interval of a time offset for a source that may drift.
+    """Widen the interval of a time offset, because the source may drift.
 
     Scale errors, heading errors and drift of odometry change the estimated offset of each part of
     the flight by more than the noise, so their scatter widens the interval. The time offset changes
@@ -334,10 +330,10 @@ def _weighted_square_sum(offset: Array, weight: Array) -> float:
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """Return the p-value of the largest step of the offset in flight; None for too few parts.
+    """Return the p-value of the largest change of the time offset in flight, if known.
 
-    Student's t-test of the weighted mean offsets before and after each step. The p-value is
-    multiplied by the number of tested steps (Bonferroni), and 1 for steps below ``MIN_CHANGE_S``.
+    Student's t-test of the weighted mean offsets before and after each tested time. The p-value is
+    multiplied by the number of tests (Bonferroni), and 1 for changes below ``MIN_CHANGE_S``.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

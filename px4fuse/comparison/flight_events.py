@@ -19,7 +19,7 @@ MIN_GAP_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class Events:
-    """Events of a flight, also before and after the segment; times in s from the first data.
+    """Events of a flight, also before and after the segment (times in s since the first data).
 
     Attributes
     ----------
@@ -49,12 +49,12 @@ class Events:
 
 
 def max_interval_s(interval_s: float) -> float:
-    """Return the longest interval (s) between positions that is not a gap, from their median."""
+    """Return the longest time (s) between positions that is not a gap."""
     return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Return the gaps (spans in s without measurements) of a source.
+    """Return the time spans (s) without measurements of a source.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
 
 
 def airborne_spans(flight: Flight) -> tuple[Span, ...]:
-    """Return the spans (s) in the air; empty without land detector."""
+    """Return the time spans (s) in the air; empty without a land detector."""
     return () if isinstance(flight.airborne, Unavailable) else flight.airborne
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect the events in the segment of a comparison, and in flight before and after it."""
+    """Collect gaps, rejections, resets and flight modes of a flight."""
     flight, segment = comparison.flight, comparison.segment.flight
     low, high = segment.start_s, segment.end_s
     time_s = np.concatenate([[low], comparison.lines[0].measurement_time_s, [high]])

@@ -47,7 +47,7 @@ class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
 
     @property
     def is_lag_only(self) -> bool:
-        """True if only the lag of EKF2's output predictor makes its errors larger than σ."""
+        """True if EKF2's errors exceed σ only because its output predictor lags."""
         nees = self.nees_position_horizon_mean
         return nees is not None and classify_ratio(nees**0.5, "truth") != "overconfident"
 
@@ -72,7 +72,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
 
 
 class UntestedFilter(Unavailable, frozen=True, kw_only=True):
-    """:class:`FilterSummary` with the reason for the missing consistency test."""
+    """Reason why a filter was not tested for consistency, with its reported σ and errors."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
@@ -94,7 +94,10 @@ class Difference(Record, frozen=True, kw_only=True):
 
 
 class Updates(Record, frozen=True, kw_only=True):
-    """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
+    """Number and times of KF's updates along one axis.
+
+    ``input_gap_s`` is the time (s) without IMU samples.
+    """
 
     count: Count
     first_s: float
@@ -131,7 +134,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
 
 
 class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
-    """:class:`AxisResult` with the KF run and the tracks.
+    """Result of the comparison along one axis, with the KF run and the tracks.
 
     Attributes
     ----------
@@ -163,7 +166,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def in_flight(self) -> "AxisComparison":
-        """Comparison with tracks also before and after the segment, for plots."""
+        """Comparison with tracks of the whole flight, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 
@@ -227,5 +230,5 @@ class Comparison:
 
 
 def north_and_east(comparison: Comparison) -> list[AxisComparison]:
-    """Return the results along north and east, if these axes were analysed."""
+    """Return the results along north and east, if available."""
     return [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]

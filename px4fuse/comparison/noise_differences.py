@@ -11,13 +11,16 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS of both axes for a noise estimate of each axis, which takes time
+# Minimum ratio of the mean NIS of both axes for separate noise estimates, which take time
 MIN_AXIS_NIS_RATIO = 1.7
-MAX_PARTS, MIN_PART_COUNT = 12, 25  # number of parts of the flight, and measurements in each part
+# Maximum number of parts into which a flight is divided
+MAX_PARTS = 12
+# Minimum number of measurements in each part of a flight
+MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):
-    """Part of the flight with larger innovations: times (s) and ratio of σ to the rest."""
+    """Part of the flight with larger innovations: times (s), and σ relative to the rest."""
 
     start_s: float
     end_s: float
@@ -26,7 +29,7 @@ class NoisyPart(NamedTuple):
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
-    """Estimate the noises along north and along east; empty if their mean NIS is similar."""
+    """Estimate separate noises along north and east, if their mean NIS differ."""
     axes = north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
     nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
@@ -43,7 +46,7 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def find_noisy_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
-    """Find the contiguous part of the flight in which most innovations are larger.
+    """Find one part of the flight in which most innovations are larger.
 
     ``axis_tuning`` is the noise estimate of both horizontal axes.
     """

@@ -28,20 +28,20 @@ from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Origins of position sources by their PX4 topic or MAVLink message
+# Origins of position sources, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth of the log as its position source",
     "Choose another --position-source, then this source is the ground truth.",
 )
-# Default axes with GNSS as source; without down, because GNSS height is much noisier and SIGMA_Z is
-# one number for all axes
+# Default axes for GNSS. Down is not included: GNSS height is much noisier, and SIGMA_Z is one
+# number for all axes
 GNSS_AXES = (AISLE, "north", "east")
 
 
 def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
-    """Choose the source, the segment and the axes of a flight; the recordings are already read.
+    """Choose position source, segment and axes of a flight.
 
     ``as_sent`` leaves out the check of the source's axes, unit and clock, and its corrections.
 
@@ -109,7 +109,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Return the flight with EKF2's GNSS innovations if GNSS is the source, else unchanged."""
+    """Select EKF2's innovations of the source: GNSS or external vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
     # missing innovations of external vision and missing other sources are not relevant with GNSS
@@ -130,7 +130,7 @@ def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Choose the position source by preference, or by name.
+    """Choose the position source automatically or by name.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Subtract the lever arm of the sensor, from EKF2 parameters, from the positions."""
+    """Move the positions from the sensor to the vehicle by EKF2's lever arm."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -213,7 +213,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Replace the height of a track by the barometer height, if requested or fused by EKF2.
+    """Use the barometer height, if it was requested or EKF2 fused it.
 
     A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
@@ -248,28 +248,21 @@ def _use_barometer_height(
 
 
 def explain_missing_source(flight: Flight) -> Unavailable:
-    """Return the reason why the log has no default position source, and the action."""
+    """Return the reason why the log has no position source, and the action."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
-    unused_track = next(
-        (track.name for track in flight.positions if not track.origin.is_automatic), ""
-    )
-    missing_topics = (
-        "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
-    )
+    topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
     remedy = (
-        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the position file with --position."
+        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
+        "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        missing_topics = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the position file of the positioning system with `position`{ulog}."
-    if unused_track:
-        remedy = (
-            "The log contains only GPS, which EKF2 did not fuse: use it with "
-            f"--position-source {unused_track}, or {remedy}"
-        )
-    reason = f"{damaged}no external position in this log ({missing_topics})"
+    if flight.positions:
+        name = flight.positions[0].name
+        remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
+    reason = f"{damaged}no external position in this log (no {topics})"
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
@@ -291,7 +284,6 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
-    """Add ``clock_offset_s`` to the timestamps of a track."""
     if clock_offset_s == 0.0:
         return track
     shifted_frames = {
@@ -305,7 +297,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the segment to analyse: position source available and vehicle airborne.
+    """Choose the time span to analyse: positions available and vehicle airborne.
 
     Parameters
     ----------

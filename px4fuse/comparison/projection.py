@@ -25,24 +25,24 @@ from px4fuse.flight.model import (
 EKF2_MIN_NOISE_M = 0.01
 # EKF2's factor from GNSS position noise to height noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
-# Minimum number of samples that two tracks have in common for statistics of their difference
+# Minimum number of common samples of two tracks for statistics of their difference
 MIN_COMMON_SAMPLES = 3
-# Projected quantity: its NED columns, and the power of the direction that weights them
+# NED columns of each projected quantity, and the power of the direction that weights them
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# EKF2's position jumps at resets are removed only if this reduces its median squared distance to
-# the measurements to this fraction. Otherwise the published state, used in flight, is kept
+# Maximum ratio of the median squared distances to the measurements, without and with EKF2's
+# position resets, for the resets to be removed
 MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
-    """Remove resets from EKF2's state if they change its frame.
+    """Remove the resets of EKF2 that move the origin of its frame.
 
     A reset that changes EKF2's frame must be removed before positions are compared. A reset that
     moves EKF2 back to the measurements corrects an error and is kept. Resets change the frame if
@@ -95,7 +95,7 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield the position without resets, in the frame of each time span between resets."""
+    """Yield EKF2's position without resets, in each of the frames between the resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
@@ -114,7 +114,7 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
 
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    """Project the columns of :data:`PROJECTED_COLUMNS` onto the axis, within the segment."""
+    """Project positions, velocities and variances onto an axis."""
     rows = cut_to_segment(frame, segment)
     available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
     projected = {
@@ -125,7 +125,7 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto the axis; EKF2 logs no cross-covariances."""
+    """Project EKF2's variances onto an axis, without covariances, which are not logged."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
@@ -137,7 +137,7 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
 
 
 def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
-    """Return EKF2's position (m) at the fusion horizon with its variance (m²); None if not logged.
+    """Return EKF2's position (m) and variance (m²) at the fusion horizon, if logged.
 
     The published position does not match the variance: the output predictor propagates it from the
     fusion horizon to the present, and lags. With external vision, the position before an update is
@@ -167,7 +167,7 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
 def project_innovations(
     flight: Flight, ekf2: Ekf2, track: PositionTrack, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project EKF2's innovations onto the axis, with the position variance at each update.
+    """Project EKF2's innovations onto an axis, with its variance before and after each update.
 
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
     ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected), NaN if R is unknown.
@@ -207,7 +207,6 @@ def project_innovations(
 
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
-    """Project innovations onto a horizontal direction, at timestamps common to both axes."""
     common = north.index.intersection(east.index)
     n, e = north.loc[common], east.loc[common]
     c, s = float(direction[0]), float(direction[1])
@@ -226,7 +225,7 @@ def observation_variance(
     segment: Segment,
     default_noise_m: float = math.nan,
 ) -> float:
-    """Compute the R (m²) that EKF2 used for the position source; NaN if unknown.
+    """Return the R (m²) that EKF2 used for the position source; NaN if unknown.
 
     ``default_noise_m`` replaces EKF2's noise parameter if the parameter is not in the log.
 
@@ -255,7 +254,7 @@ def observation_variance(
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project position and velocity of the ground truth onto the axis."""
+    """Project the ground truth onto an axis."""
     if isinstance(truth, Unavailable):
         return truth
     projected = project(truth.samples, axis, segment)

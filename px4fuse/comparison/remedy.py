@@ -15,11 +15,13 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of √R to EKF2_EVP_NOISE with which R is the variance that the sender reports
+# Minimum ratio of √R and EKF2_EVP_NOISE for an R that the sender reports
 MIN_REPORTED_RATIO = 1.25
-# Prediction step of EKF2 (ms, EKF2_PREDICT_US), and transmission time of a position message (ms)
-PREDICTION_STEP_MS, TRANSMISSION_MS = 10.0, 30.0
-# Multiple (ms) to which EKF2_DELAY_MAX is rounded up
+# Prediction step (ms) of EKF2 (EKF2_PREDICT_US)
+PREDICTION_STEP_MS = 10.0
+# Transmission time (ms) of a position message
+TRANSMISSION_MS = 30.0
+# Step (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
 
 
@@ -29,7 +31,7 @@ def ml_ekf2_parameters(
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
 ) -> dict[str, float]:
-    """Return maximum-likelihood EKF2 parameters, by PX4 name and in PX4's units.
+    """Return the maximum-likelihood values of EKF2's noise and delay parameters.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """Return EKF2's estimated delay as a parameter change; empty if not significant."""
+    """Return the estimated delay parameter of EKF2, if it differs significantly."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
@@ -78,15 +80,14 @@ def ml_delay_change(
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
-    """Return the aiding source as which EKF2 fuses the positions along an axis."""
+    """Return EKF2's aiding source for the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:
-    """Return the position age (ms) that EKF2 subtracts from the timestamps.
+    """Return the delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
-    None if the parameter is not logged, EKF2 never fuses the source, or the receiver reports
-    measurement times.
+    None if the parameter is not logged or EKF2 does not use it.
     """
     source = comparison.source
     if source.origin.aid is None:
@@ -102,7 +103,7 @@ def delay_ms(comparison: Comparison) -> float | None:
 def noise_change(
     aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
 ) -> dict[str, float]:
-    """Return the EKF2 parameters for a position noise ``noise_m``, rounded to two digits.
+    """Return the EKF2 parameters for a position noise ``noise_m``.
 
     ``settings`` and ``used_m`` (median √R) are the parameters and the noise as flown.
     """
@@ -115,7 +116,7 @@ def noise_change(
 
 
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a position delay ``delay_ms``, for early timestamps 0.
+    """Return the EKF2 parameters for a position delay ``delay_ms``; early timestamps give 0.
 
     Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source.
     """
@@ -131,7 +132,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def noise_used_m(model: Model) -> float:
-    """Return the median √R (m) of the position source that EKF2 used as flown."""
+    """Return the median √R (m) that EKF2 used for the positions."""
     updates = model.flown.updates
     columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
     return float(np.sqrt(np.median(updates[columns].to_numpy())))

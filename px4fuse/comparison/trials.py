@@ -4,24 +4,49 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Literal
 
+import numpy as np
+
 from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
-from px4fuse.filter.consistency import Reference, classify_ratio
+from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
+from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
+# Statistics that re-runs try to bring inside their limits
+DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
+# Keys of Trial.change that are neither settings of KF nor EKF2 parameters
+CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum factor on a σ ratio, or relative change of the position RMSE, for a re-run to have an
-# effect
-MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
-# Minimum relative reduction of the position RMSE for a re-run to improve the position
+# Minimum mean NEES for errors larger than the reported σ: 2 σ; flights without a fault have less
+# than 3
+MIN_NEES_FINDING = 4.0
+# Maximum mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+MAX_NEES_AFTER_CHANGE = 2.0
+# Maximum distance from 1 of the explained fraction of a cause: it explains at least half
+MAX_CAUSE_DISTANCE = 0.5
+# Maximum distance from 1 of the explained fraction of a sensor fault that is the only cause: the
+# noises of the re-run are approximate
+SENSOR_CAUSE_TOLERANCE = 0.25
+# Maximum distance from 1 of the explained fraction of a change that is combined with another one
+MAX_HELPFUL_DISTANCE = 0.9
+# Changes that correct a sensor fault; they are preferred to changes of settings
+SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# Changes that another change requires; they are not counted
+ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
+# Minimum factor on a σ ratio for a re-run with an effect
+MIN_RATIO_CHANGE = 1.10
+# Minimum relative change of the position RMSE for a re-run with an effect
+MIN_RMSE_CHANGE = 0.05
+# Minimum relative reduction of the position RMSE for a re-run that improves the position
 POSITION_IMPROVEMENT = 0.20
-# A re-run leaves an error if ln(error ÷ σ) stays above this fraction of its value before
+# Maximum ratio of ln(error ÷ σ) after and before a re-run that corrects the error
 MAX_ERROR_LEFT = 0.75
 
 
 class RunStatistics(Record, frozen=True, kw_only=True):
-    """Statistics of one filter along one axis in one run (flown, or re-run with a change).
+    """Statistics of one run of a filter along one axis.
 
     Attributes
     ----------
@@ -43,7 +68,6 @@ class RunStatistics(Record, frozen=True, kw_only=True):
     rejected_fraction: Share | None = None
 
     def value(self, statistic: Statistic) -> float | None:
-        """Return the mean NIS, mean NEES or RMS difference KF - EKF2."""
         return {
             "nis": self.nis_mean,
             "nees": self.nees_mean,
@@ -52,18 +76,25 @@ class RunStatistics(Record, frozen=True, kw_only=True):
 
 
 class Trial(Record, frozen=True, kw_only=True):
-    """Re-run of one filter along the main axis with one or two changes.
+    """Re-run of one filter along one axis with a change, and its effect.
 
     Attributes
     ----------
     filter : {"kf", "ekf2"}
+    axis : str
     kinds : tuple of str
         Kind of each change: for KF noises, defaults or bias, for EKF2 delay, noise, gate or process
         noise, for both outliers, time offset or rotation.
     change : mapping from name to value
-        See :class:`px4fuse.comparison.causal_replays.Intervention`.
+        Fields of Settings, PX4 parameters, ``turned_deg`` (rotation of the positions, clockwise
+        from above), ``outliers_left_out`` (number), and the removed accelerometer biases
+        ``bias_forward_m_s2`` and ``bias_right_m_s2``.
+    discrepancies : tuple of {"nis", "nees"}
+        Statistics outside their limits that the change may explain.
     before : RunStatistics
-        Statistics as flown, of the same samples; for EKF2 from the log.
+        Statistics as flown, of the same samples.
+    is_logged : bool
+        False if ``before`` is of a replay of EKF2, because it differs from the log.
     after : RunStatistics
         Statistics with the change; for EKF2 from its replay.
     from_s : float or None
@@ -71,21 +102,116 @@ class Trial(Record, frozen=True, kw_only=True):
     """
 
     filter: FilterName
+    axis: str
     kinds: tuple[str, ...]
     change: Change
+    discrepancies: tuple[Statistic, ...] = ()
     before: RunStatistics
+    is_logged: bool = True
     after: RunStatistics
     from_s: float | None = None
 
+    @property
+    def corrects_sensor(self) -> bool:
+        """True if the change corrects a fault of a sensor, not a setting."""
+        return not SENSOR_CHANGES.isdisjoint(self.change)
+
+
+def explained_fraction(trial: Trial, statistic: Statistic) -> float:
+    """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
+
+    Above 1 the change overshoots. For the RMS difference KF - EKF2, the fraction of the mean
+    square; 0 without a difference.
+    """
+    before, after = trial.before.value(statistic), trial.after.value(statistic)
+    if not before or not after:
+        return 0.0
+    if statistic == "difference":
+        return 1.0 - (after / before) ** 2
+    return 1.0 - float(np.log(after) / np.log(before))
+
+
+def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
+    """Return True if the change brings the mean NIS or mean NEES inside its limits."""
+    low, high = nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
+    return low <= (trial.after.value(statistic) or np.nan) <= high
+
+
+def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
+    """Return True if the change makes σ smaller than the errors against ground truth."""
+    nees, nis, nees_after = trial.before.nees_mean, trial.before.nis_mean, trial.after.nees_mean
+    if statistic != "nis" or nis is None or nis >= 1.0 or nees_after is None:
+        return False
+    return nees_after >= (MAX_NEES_AFTER_CHANGE if nees and nees > 1.0 else MIN_NEES_FINDING)
+
+
+def find_trials(
+    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> list[Trial]:
+    """Return the re-runs that may explain a mean NIS or mean NEES outside its limits."""
+    return [
+        trial
+        for trial in trials
+        if (trial.filter, trial.axis) == (filter_name, axis) and statistic in trial.discrepancies
+    ]
+
+
+def find_cause(
+    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> Trial | None:
+    """Return the re-run that best explains a mean NIS or mean NEES outside its limits.
+
+    A cause explains 50 to 150 % of the logarithm and does not contradict ground truth. Preferred
+    are, in this order, complete causes, fewer changes, sensor faults, and fractions near 1.
+    """
+
+    def rank(trial: Trial) -> tuple[bool, int, bool, float]:
+        distance = abs(explained_fraction(trial, statistic) - 1.0)
+        is_complete = trial.corrects_sensor and distance <= SENSOR_CAUSE_TOLERANCE
+        return (
+            not (is_complete or is_sufficient(trial, statistic)),
+            len(trial.change.keys() - ACCOMPANYING_CHANGES),
+            not trial.corrects_sensor,
+            distance,
+        )
+
+    causes = (
+        trial
+        for trial in find_trials(trials, filter_name, axis, statistic)
+        if abs(explained_fraction(trial, statistic) - 1.0) <= MAX_CAUSE_DISTANCE
+        and not contradicts_truth(trial, statistic)
+    )
+    return min(causes, key=rank, default=None)
+
+
+def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
+    """Return the re-runs that explain a part of a discrepancy, best first.
+
+    The list is empty if one of the changes is sufficient.
+    """
+
+    def distance(trial: Trial) -> float:
+        return abs(explained_fraction(trial, statistic) - 1.0)
+
+    helpful = sorted(
+        (
+            trial
+            for trial in trials
+            if statistic in trial.discrepancies and distance(trial) < MAX_HELPFUL_DISTANCE
+        ),
+        key=distance,
+    )
+    return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
+
 
 def distance_from_one(outcome: RunStatistics) -> float:
-    """Return the sum of |ln σ ratio|, against source and ground truth."""
+    """Return the sum of |ln σ ratio| against source and ground truth."""
     means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
     return sum(0.5 * abs(math.log(mean)) for mean in means)
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
-    """Return the sort key of re-runs of one kind; the best re-run has the smallest key."""
+    """Return a sort key for re-runs of the same kind; the best one has the smallest key."""
     enters = enters_band(trial)
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
@@ -100,12 +226,12 @@ def ratios(outcome: RunStatistics) -> dict[Reference, float]:
 
 
 def reduction(trial: Trial) -> float:
-    """Return the reduction of :func:`distance_from_one` by a re-run."""
+    """Return the decrease of :func:`distance_from_one` by a re-run."""
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
 def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return reference (source or ground truth) and σ ratio before and after a re-run."""
+    """Return the reference and the σ ratios before and after a re-run, for each reference."""
     before, after = ratios(trial.before), ratios(trial.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
@@ -119,7 +245,7 @@ def enters_band(trial: Trial) -> bool:
 
 
 def halves(trial: Trial) -> bool:
-    """Return True if a re-run halves |ln σ ratio| of an inconsistent ratio."""
+    """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
     return any(
         classify_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
@@ -128,7 +254,7 @@ def halves(trial: Trial) -> bool:
 
 
 def leaves_error(trial: Trial) -> bool:
-    """Return True if a filter stays overconfident against ground truth by nearly as much."""
+    """Return True if a filter remains nearly as overconfident against ground truth."""
     return any(
         name == "truth"
         and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
@@ -140,7 +266,7 @@ def leaves_error(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], owner: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the best re-run of one filter with one kind of change, or None if none improves.
+    """Return the best re-run of one filter with one kind of change, if it improves anything.
 
     Parameters
     ----------
@@ -177,9 +303,9 @@ def has_effect(trial: Trial) -> bool:
 
 
 def can_improve(trial: Trial) -> bool:
-    """Return True if a re-run could show an improvement.
+    """Return True if a re-run is able to show an improvement.
 
-    This requires a known position RMSE, or a σ ratio that is inconsistent without the change.
+    This needs ground truth, or a σ ratio that is inconsistent without the change.
     """
     return trial.before.position_rmse_m is not None or any(
         classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)

@@ -22,26 +22,48 @@ from px4fuse.convention.model import Axes, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
 from px4fuse.core.arrays import Array, IntArray
 
+# Maximum tested time offset (s) of the positions
 MAX_OFFSET_S = 10.0
+# Minimum common time (s) of positions and IMU
 MIN_OVERLAP_S = 10.0
-# Minimum scale (m) of the residuals: IMU noise, tilt and interpolation over T
-MIN_SIGMA_M, MIN_SIGMA_DOWN_M = 0.05, 0.08
+# Minimum scale (m) of the horizontal residuals: IMU noise, tilt and interpolation over T
+MIN_SIGMA_M = 0.05
+# Minimum scale (m) of the vertical residuals
+MIN_SIGMA_DOWN_M = 0.08
+# Degrees of freedom of the Student distribution of the residuals
 FREEDOM = 4.0
-UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}  # m
-SMALL_ROTATION = np.radians(8.0)  # a smaller rotation is not another convention
+# Length units in metres
+UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
+# Maximum rotation (rad) that is not a different convention
+SMALL_ROTATION = np.radians(8.0)
+# Maximum time offset (s) without a lower prior
 SMALL_OFFSET_S = 0.3
-# Log prior odds of a rotation, a time offset and a unit other than metres
-ROTATION_ODDS, OFFSET_ODDS, UNIT_ODDS = -1.0, -2.0, -2.0
-BAROMETER_SIGMA_M, BAROMETER_WEIGHT = 0.5, 6.0
-MAX_REFINED, MAX_DEFICIT = 8, 60.0  # hypotheses of the coarse search that are refined
-MAX_ROWS = 1200  # of the refinement
+# Log prior odds of a rotated frame
+ROTATION_ODDS = -1.0
+# Log prior odds of a time offset above SMALL_OFFSET_S
+OFFSET_ODDS = -2.0
+# Log prior odds of a unit other than metres
+UNIT_ODDS = -2.0
+# Standard deviation (m) of barometer heights
+BAROMETER_SIGMA_M = 0.5
+# Number of independent barometer heights in the likelihood
+BAROMETER_WEIGHT = 6.0
+# Maximum number of hypotheses of the coarse search that are refined
+MAX_REFINED = 8
+# Maximum log likelihood ratio of the best hypothesis to another one that is refined
+MAX_DEFICIT = 60.0
+# Maximum number of samples in the refinement
+MAX_ROWS = 1200
+# Number of Gauss-Newton steps
 ITERATIONS = 7
-MAX_STEP_S = 0.15  # of the time offset per iteration
-# Prior precision of time offset (s), rotation (rad), drift of the gyro's heading (σ 0.05 °/s),
-# clock drift, accelerometer bias (σ 0.3 m/s²)
+# Maximum change (s) of the time offset in one Gauss-Newton step
+MAX_STEP_S = 0.15
+# Prior precision of Hypothesis.parameters: gyro heading drift (σ 0.05 °/s), accelerometer bias (σ
+# 0.3 m/s²)
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
+# Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
+# Log prior odds of the axes x, y, z. Left-handed frames have one wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # as stated
     ("east", "north", "up"): -0.5,
@@ -53,7 +75,10 @@ AXES_ODDS: Final[dict[Axes, float]] = {
 
 
 class Family(NamedTuple):
-    """Vertical axis and its sign (1: down), other axes a and b, handedness seen from above."""
+    """Assignment of the axes x, y, z: the vertical one with its sign, and both horizontal ones.
+
+    ``sign`` is 1 if the vertical axis points down, ``hand`` is 1 if b is clockwise from a.
+    """
 
     vertical: int
     sign: int
@@ -74,7 +99,6 @@ class Family(NamedTuple):
         return names[0], names[1], names[2]
 
     def log_odds(self, quarter: int) -> float:
-        """Return the log prior odds of the axes."""
         axes = self.axes(quarter)
         other = -2.0 if self.vertical == 2 or axes[1] == "up" else -4.0
         return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other)
@@ -96,11 +120,11 @@ class Positions:
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "Positions":
-        """Return the positions with the drift removed from the timestamps."""
+        """Return the positions with timestamps without a clock drift."""
         return replace(self, time_s=without_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
-        """Return the motion on the grid of the IMU, extended by the largest time offset."""
+        """Return the second differences of the positions, for all tested time offsets."""
         edge = round(self.max_offset_s / GRID_S)
         grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
         return SourceMotion.of(self.time_s, self.position_m, grid)
@@ -108,7 +132,7 @@ class Positions:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Map from the positions of a source to NED, with its likelihood.
+    """Assumed convention of the positions of a source, with its likelihood.
 
     Attributes
     ----------
@@ -146,7 +170,7 @@ class Hypothesis:
 
     @property
     def offset_s(self) -> float:
-        """Delay of the timestamps."""
+        """Delay (s) of the timestamps."""
         return float(self.parameters[0])
 
     @property
@@ -161,7 +185,7 @@ class Hypothesis:
 
     @property
     def remainder_rad(self) -> float:
-        """Rotation beyond the quarter turns."""
+        """Rotation (rad) in addition to the quarter turns."""
         return float(self.parameters[1] - self.quarter * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
@@ -172,13 +196,16 @@ class Hypothesis:
 
 
 def without_drift(time_s: Array, drift: float) -> Array:
-    """Return timestamps of a clock without its drift; their mean remains."""
+    """Remove the drift of a clock from timestamps; their mean remains."""
     middle = float(np.mean(time_s))
     return middle + (time_s - middle) / (1.0 + drift)
 
 
 def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
-    """Return the refined hypotheses, best first; empty without enough overlap or motion."""
+    """Return all likely conventions of the positions, best first.
+
+    Empty without enough common time or motion.
+    """
     refined = []
     for heading_from, imu in motions.items():
         source = positions.motion(imu)
@@ -190,13 +217,16 @@ def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> 
                 parameters[1] -= candidate.remainder_rad
                 start = replace(start, parameters=parameters, has_rotation=False)
                 refined.append(refine(start, positions, source, imu))
-    return sorted((one for one in refined if one.score > -np.inf), key=lambda one: -one.score)
+    return sorted(
+        (hypothesis for hypothesis in refined if hypothesis.score > -np.inf),
+        key=lambda hypothesis: -hypothesis.score,
+    )
 
 
 def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
-    """Return the best hypotheses on a grid of time offsets, from Gaussian likelihoods.
+    """Search for likely conventions on a grid of time offsets.
 
-    Each has the best time offset for its axes (to a quarter turn) and unit.
+    For each unit and each assignment of the axes, the best time offset is returned.
     """
     left = np.column_stack([source.table, source.table**2, source.is_valid])
     right = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
@@ -222,16 +252,20 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
     score = 0.5 * windows * (score - np.log(np.maximum(down, MIN_SIGMA_DOWN_M**2)))
     angle = np.angle(correlation)
     quarter = np.round(angle / (np.pi / 2.0)).astype(int) % 4
-    found = []
+    hypotheses = []
     for k in range(4):
         score_of_quarter = np.where((quarter == k)[..., None], score, -np.inf)
         for (f, u), row in np.ndenumerate(np.argmax(score_of_quarter, axis=0)):
             name, family = [*UNITS][u], FAMILIES[f]
             total = score_of_quarter[row, f, u] + family.log_odds(k) + UNIT_ODDS * (name != "m")
             parameters = np.array([offset_s[row], angle[row, f], *[0.0] * 5])
-            found.append(Hypothesis(family, name, parameters, float(total)))
-    found.sort(key=lambda one: -one.score)
-    return [one for one in found[:MAX_REFINED] if one.score > found[0].score - MAX_DEFICIT]
+            hypotheses.append(Hypothesis(family, name, parameters, float(total)))
+    hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
+    return [
+        hypothesis
+        for hypothesis in hypotheses[:MAX_REFINED]
+        if hypothesis.score > hypotheses[0].score - MAX_DEFICIT
+    ]
 
 
 def refine(
@@ -242,19 +276,19 @@ def refine(
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
     best, parameters = replace(start, score=-np.inf), start.parameters
     for _ in range(ITERATIONS):
-        one, step = _evaluate(replace(start, parameters=parameters), rows, source, imu)
-        if one.score > best.score:
-            best = one
+        hypothesis, step = _evaluate(replace(start, parameters=parameters), rows, source, imu)
+        if hypothesis.score > best.score:
+            best = hypothesis
         parameters = parameters + step
     return replace(best, score=best.score + _log_odds(best, positions))
 
 
 def _evaluate(
-    one: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
+    hypothesis: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
 ) -> tuple[Hypothesis, Array]:
-    """Return a hypothesis with its score, and the Gauss-Newton step of the parameters."""
-    offset_s, angle, heading_drift, clock_drift = one.parameters[:4]
-    bias, time_s = one.parameters[4:], source.time_s[rows]
+    """Return a hypothesis with its log likelihood, and the next change of its parameters."""
+    offset_s, angle, heading_drift, clock_drift = hypothesis.parameters[:4]
+    bias, time_s = hypothesis.parameters[4:], source.time_s[rows]
     row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
     at = time_s - offset_s - clock_drift * (time_s - middle_s)
     at = (at - imu.time_s[0]) / GRID_S
@@ -262,13 +296,13 @@ def _evaluate(
     used = (at >= 0) & (at < len(imu.time_s) - 1) & imu.is_valid[index]
     windows = float(np.count_nonzero(used)) * row_s / WINDOW_S
     if windows * WINDOW_S < MIN_OVERLAP_S:
-        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
+        return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     index, time_s = index[used], time_s[used]
     flown_s = time_s - time_s[0]
     fraction = (at[used] - index)[:, None, None]
     table = (1.0 - fraction) * imu.table[index] + fraction * imu.table[index + 1]
-    sent, (vertical, sign, a, b, hand) = source.table[rows[used]], one.family
-    unit = UNITS[one.unit]
+    sent, (vertical, sign, a, b, hand) = source.table[rows[used]], hypothesis.family
+    unit = UNITS[hypothesis.unit]
     turn = unit * np.exp(1j * (angle + heading_drift * flown_s))
     horizontal = turn * (sent[:, a] + 1j * hand * sent[:, b])
     ned = np.column_stack([horizontal.real, horizontal.imag, unit * sign * sent[:, vertical]])
@@ -286,26 +320,28 @@ def _evaluate(
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     )
-    if 0.0 in (ned_square, product, square):  # at rest, no hypothesis can be scored
-        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
+    if 0.0 in (ned_square, product, square):  # a vehicle at rest shows no convention
+        return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
     jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = table[..., 1:]
-    is_drifting = one.heading_from != "EKF2"
-    free = np.array([True, one.has_rotation, is_drifting, one.has_clock_drift, *[True] * 3])
+    is_drifting = hypothesis.heading_from != "EKF2"
+    free = np.array(
+        [True, hypothesis.has_rotation, is_drifting, hypothesis.has_clock_drift, *[True] * 3]
+    )
     weights, columns = weight[[0, 0, 1]].T.ravel(), jacobian[..., free].reshape(-1, free.sum())
     weighted = columns.T * weights
     normal = weighted @ columns + np.diag(PRECISION[free] + 1e-9)
-    gradient = weighted @ residual.ravel() + (PRECISION * one.parameters)[free]
+    gradient = weighted @ residual.ravel() + (PRECISION * hypothesis.parameters)[free]
     step = np.zeros(len(PRECISION))
     step[free] = -np.linalg.solve(normal, gradient)
     step[0] = np.clip(step[0], -MAX_STEP_S, MAX_STEP_S)
     scored = replace(
-        one,
-        score=float(windows * gain - 0.5 * PRECISION @ one.parameters**2),
+        hypothesis,
+        score=float(windows * gain - 0.5 * PRECISION @ hypothesis.parameters**2),
         scale=product / square,
         max_scale=ned_square / product,
         sigma_m=sigma_m,
@@ -315,7 +351,7 @@ def _evaluate(
 
 
 def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[float, float]:
-    """Return the mean Student log likelihood of squared residuals, and its scale (maximised)."""
+    """Return the largest mean log likelihood of a Student distribution, and its scale."""
     variance = max(float(np.median(squares)) / (0.455, 1.386)[dimensions - 1], min_sigma**2)
     for _ in range(5):
         weight = (FREEDOM + dimensions) / (FREEDOM + squares / variance)
@@ -325,17 +361,21 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
     return float(score), float(np.sqrt(variance))
 
 
-def _log_odds(one: Hypothesis, positions: Positions) -> float:
-    """Return the log prior odds of a hypothesis, and the log likelihood of its height."""
-    odds = one.family.log_odds(one.quarter) + UNIT_ODDS * (one.unit != "m")
-    odds += OFFSET_ODDS * (abs(one.offset_s) > SMALL_OFFSET_S)
-    if one.has_rotation:
-        odds -= 0.5 * float(np.log(max(one.windows, 2.0)))
-        odds += ROTATION_ODDS if abs(one.remainder_rad) > SMALL_ROTATION else -0.5
+def _log_odds(hypothesis: Hypothesis, positions: Positions) -> float:
+    """Return the log prior odds of a hypothesis plus the log likelihood of its heights."""
+    odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
+    odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
+    if hypothesis.has_rotation:
+        odds -= 0.5 * float(np.log(max(hypothesis.windows, 2.0)))
+        odds += ROTATION_ODDS if abs(hypothesis.remainder_rad) > SMALL_ROTATION else -0.5
     if positions.barometer is None:
         return odds
-    barometer = np.interp(positions.time_s - one.offset_s, *positions.barometer)
-    down = UNITS[one.unit] * one.family.sign * positions.position_m[:, one.family.vertical]
+    barometer = np.interp(positions.time_s - hypothesis.offset_s, *positions.barometer)
+    down = (
+        UNITS[hypothesis.unit]
+        * hypothesis.family.sign
+        * positions.position_m[:, hypothesis.family.vertical]
+    )
     error = down - np.median(down) + barometer - np.median(barometer)
     square = float(np.mean(np.minimum(error**2, (20.0 * BAROMETER_SIGMA_M) ** 2)))
     floor = BAROMETER_SIGMA_M**2

@@ -34,18 +34,33 @@ from px4fuse.convention.texts import format_axes
 from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import heading
 
-MIN_LOG_ODDS = 4.0  # log likelihood minus that of the best other convention
-MIN_GAIN = 8.0  # log likelihood minus that of positions without relation to the motion
-MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # if the convention is determined, or ambiguous
-MIN_SCALE, MAX_SCALE = 0.88, 1.12  # distances of the source over those of the IMU
-# Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
-MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05
-MAX_LOGGED_DEFICIT = 20.0  # by which the logged heading may fit worse than the gyro's
-MIN_DRIFT_GAIN = 15.0  # log likelihood gained by a clock drift
+# Minimum log likelihood ratio to the second best convention for an unambiguous result
+MIN_LOG_ODDS = 4.0
+# Minimum log likelihood ratio to positions that are unrelated to the motion
+MIN_GAIN = 8.0
+# Minimum log likelihood ratio for each window, for an unambiguous and for an ambiguous convention
+MIN_GAIN_PER_WINDOW = (0.15, 0.4)
+# Range of the ratio of distances from the source and from the IMU, for a certain convention
+MIN_SCALE, MAX_SCALE = 0.88, 1.12
+# Maximum ratio of the residuals to those that source noise and IMU error explain
+MAX_RESIDUAL_RATIO = 2.4
+# Minimum position error (m) of the IMU
+IMU_ERROR_M = 0.05
+# Maximum log likelihood ratio of the gyro's heading to the logged heading, for the logged one to be
+# used
+MAX_LOGGED_DEFICIT = 20.0
+# Minimum gain of the log likelihood for accepting a clock drift
+MIN_DRIFT_GAIN = 15.0
+# Tested clock drifts (rate of the clock minus 1)
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-MAX_REPEATED_SHARE = 0.5  # of repeated positions that are left out; also minimum share with height
-# Sums of the squares of the coefficients of third and second differences
-THIRD_DIFFERENCE, SECOND_DIFFERENCE = 20.0, 6.0
+# Maximum fraction of repeated positions that are left out
+MAX_REPEATED_SHARE = 0.5
+# Minimum fraction of positions with a height, for the height to be used
+MIN_HEIGHT_SHARE = 0.5
+# Sum of the squared coefficients of third differences
+THIRD_DIFFERENCE = 20.0
+# Sum of the squared coefficients of second differences
+SECOND_DIFFERENCE = 6.0
 
 
 def check_convention(
@@ -72,27 +87,27 @@ def check_convention(
     motions = {
         name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
     }
-    found = _search(positions, motions)
-    if not found:
+    hypotheses = _search(positions, motions)
+    if not hypotheses:
         return Convention(verdict="not determinable")
-    if drift := _clock_drift(positions, motions[found[0].heading_from], found[0]):
+    if drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         corrected = positions.with_clock_drift(drift)
         with_drift = _search(corrected, motions)
-        if with_drift and with_drift[0].score > found[0].score + MIN_DRIFT_GAIN:
-            found, positions = with_drift, corrected
+        if with_drift and with_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN:
+            hypotheses, positions = with_drift, corrected
         else:
             drift = 0.0
-    convention = _decide(found, positions, drift)
+    convention = _decide(hypotheses, positions, drift)
     if track.orientation is None:
         return convention
-    orientation = _check_orientation(inertial, track, positions, found[0], convention.verdict)
+    orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
     return structs.replace(convention, orientation=orientation)
 
 
 def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
-    """Return the positions without repeated ones; a missing height is 0."""
+    """Return the positions without repetitions, with height 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MAX_REPEATED_SHARE:
+    if samples["down_m"].notna().mean() < MIN_HEIGHT_SHARE:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
@@ -105,29 +120,28 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
 
 
 def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
-    """Return the hypotheses with both headings, best first.
+    """Return the likely conventions with both headings, best first.
 
-    If the logged heading fits about as well as the gyro's, it is preferred: it refers to north, the
-    gyro's only to the heading at the start.
+    The logged heading is preferred if it fits nearly as well, because it refers to north.
     """
-    found = search(positions, motions)
-    for one in found:
+    hypotheses = search(positions, motions)
+    for hypothesis in hypotheses:
         if (
-            one.heading_from == "EKF2"
-            and one.score > found[0].score - MAX_LOGGED_DEFICIT
-            and one.is_similar_to(found[0], SMALL_ROTATION)
+            hypothesis.heading_from == "EKF2"
+            and hypothesis.score > hypotheses[0].score - MAX_LOGGED_DEFICIT
+            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION)
         ):
-            others = [other for other in found if other is not one]
-            return [replace(one, score=found[0].score), *others]
-    return found
+            others = [other for other in hypotheses if other is not hypothesis]
+            return [replace(hypothesis, score=hypotheses[0].score), *others]
+    return hypotheses
 
 
-def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Convention:
-    """Compare the best hypothesis with the others and with the noise of the source."""
-    best = found[0]
-    rivals = [one for one in found if not one.is_similar_to(best)]
+def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) -> Convention:
+    """Compare the best convention with the other ones and with the noise of the source."""
+    best = hypotheses[0]
+    rivals = [hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best)]
     if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
-        rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
+        rivals = [hypothesis for hypothesis in rivals if hypothesis.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
     verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
@@ -141,7 +155,11 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
     ):
         verdict = "doubtful"
     x, y, z = best.axes
-    likely = [_describe(one) for one in rivals if one.score > best.score - MIN_LOG_ODDS]
+    likely = [
+        _describe(hypothesis)
+        for hypothesis in rivals
+        if hypothesis.score > best.score - MIN_LOG_ODDS
+    ]
     return Convention(
         verdict=verdict,
         x=x,
@@ -160,39 +178,42 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
     )
 
 
-def _describe(one: Hypothesis) -> str:
-    """Describe a hypothesis in words."""
-    rotation = f", rotated by {-np.degrees(one.remainder_rad):+.0f}°" if one.has_rotation else ""
-    axes = format_axes(one.axes, one.unit)
-    return f"{axes}{rotation}, timestamps {one.offset_s:+.1f} s late"
+def _describe(hypothesis: Hypothesis) -> str:
+    rotation = (
+        f", rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°"
+        if hypothesis.has_rotation
+        else ""
+    )
+    axes = format_axes(hypothesis.axes, hypothesis.unit)
+    return f"{axes}{rotation}, timestamps {hypothesis.offset_s:+.1f} s late"
 
 
-def residual_ratio(one: Hypothesis, positions: Positions) -> float:
-    """Return the residuals over those that noise of the source and error of the IMU explain.
+def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
+    """Return the ratio of the residuals to those of source noise and IMU error.
 
-    The noise is that of third differences, which contain hardly any motion.
+    The noise is estimated from third differences, which contain hardly any motion.
     """
     third = np.diff(positions.position_m, 3, axis=0)
     deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
-    noise_m = UNITS[one.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
-    return float(one.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
+    noise_m = UNITS[hypothesis.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+    return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
 
 def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
-    """Return the most likely drift of the clock; if nothing fits, drifts of 5 % are tried."""
+    """Return the most likely clock drift of the sender, or 0."""
     start = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
-        found = [
+        hypotheses = [
             (candidates[0], drift)
             for drift in DRIFTS.tolist()
             if (candidates := find_candidates(positions.with_clock_drift(drift).motion(imu), imu))
         ]
-        candidate, start = max(found, key=lambda pair: pair[0].score)
+        candidate, start = max(hypotheses, key=lambda pair: pair[0].score)
         best = replace(candidate, heading_from=best.heading_from)
         positions = positions.with_clock_drift(start)
-    one = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
-    drift = (1.0 + start) / (1.0 - float(one.parameters[3])) - 1.0
-    return drift if start or one.score > best.score + MIN_DRIFT_GAIN else 0.0
+    hypothesis = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
+    drift = (1.0 + start) / (1.0 - float(hypothesis.parameters[3])) - 1.0
+    return drift if start or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
 
 
 def _check_orientation(
@@ -202,10 +223,7 @@ def _check_orientation(
     best: Hypothesis,
     verdict: Verdict,
 ) -> OrientationConvention | None:
-    """Check the orientation, and its heading against the positions.
-
-    For the second, the source's heading replaces the logged one: this needs no reference to north.
-    """
+    """Check the convention of the orientation, and its heading against the positions."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     checked = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
@@ -223,9 +241,13 @@ def _check_orientation(
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
     if best.family.sign > 0:
         directions_deg = [0.0]
-    for one in search(positions, {"EKF2": motion}):
-        if (one.family, one.unit, one.has_rotation) == (best.family, best.unit, True):
-            x_deg = float(np.degrees(one.parameters[1]))
+    for hypothesis in search(positions, {"EKF2": motion}):
+        if (hypothesis.family, hypothesis.unit, hypothesis.has_rotation) == (
+            best.family,
+            best.unit,
+            True,
+        ):
+            x_deg = float(np.degrees(hypothesis.parameters[1]))
             errors = [(x_deg - at_deg + 180.0) % 360.0 - 180.0 for at_deg in directions_deg]
             return structs.replace(convention, heading_error_deg=min(errors, key=abs))
     return convention

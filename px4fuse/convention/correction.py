@@ -16,17 +16,21 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) of a frame with other axes, and of a frame that is only rotated: smaller
-# ones are in the reach of the estimate of the heading error
-MIN_REMAINDER_DEG, MIN_ROTATION_DEG = 8.0, 15.0
-MIN_LATE_S = 0.5  # smaller time offsets are in the reach of the estimate of the time offset
-MIN_HEADING_ERROR_DEG = 10.0  # of an orientation relative to its own positions
+# Minimum rotation (°) of a frame with wrong axes: the estimate of the heading error covers less
+MIN_REMAINDER_DEG = 8.0
+# Minimum rotation (°) of a frame that is only rotated
+MIN_ROTATION_DEG = 15.0
+# Minimum time offset (s) for a correction: the estimate of the time offset covers smaller ones
+MIN_LATE_S = 0.5
+# Minimum heading error (°) of an orientation relative to its own positions
+MIN_HEADING_ERROR_DEG = 10.0
+# Kinds of orientation faults; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
 @dataclass(frozen=True)
 class Faults:
-    """Significant faults of a convention.
+    """Faults of a position source that its convention shows.
 
     Attributes
     ----------
@@ -59,16 +63,15 @@ class Faults:
 
     @property
     def of_positions(self) -> bool:
-        """True if the positions as sent are wrong."""
+        """True if the positions, their unit or their timestamps are wrong."""
         return bool(self.axes or self.rotation_deg or self.unit or self.late_s or self.clock_drift)
 
     def __bool__(self) -> bool:
-        """Return True if there is any fault."""
         return self != Faults()
 
 
 def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a convention; ``frame`` is the stated frame of the source."""
+    """Return the faults of a source; ``frame`` is the frame that it states."""
     if convention is None:
         return Faults()
     fault = _orientation_fault(convention)
@@ -104,7 +107,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
-    """Return True for axes other than NED, and the significant rotation (°) of the positions."""
+    """Return True for axes other than NED, and the rotation (°) of the positions."""
     rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
     is_known = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known or convention.z not in ("up", "down"):
@@ -132,11 +135,10 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
 def correct(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
-    """Return the flight and the source without the faults of the convention.
+    """Convert positions and orientation of a source to the convention of PX4.
 
-    The positions become NED in metres, on the clock of the autopilot. A faulty orientation is
-    converted or left out. If EKF2 fused a faulty source, the attitude of the gyroscopes replaces
-    EKF2's, so that positions and attitude agree.
+    If EKF2 fused a faulty source, EKF2's attitude is faulty, too. The attitude from the gyroscopes
+    replaces it.
     """
     faults = find_faults(convention, flight, track.frame)
     if convention is None or not faults:
@@ -173,7 +175,7 @@ def correct(
 
 
 def _matrix(convention: Convention, faults: Faults) -> Array:
-    """Return the matrix from the positions as sent to NED in metres."""
+    """Return the matrix that converts the positions to NED in metres."""
     scale = UNITS[convention.unit]
     if not faults.axes and not faults.rotation_deg:
         return scale * np.eye(3)
@@ -189,5 +191,4 @@ def _matrix(convention: Convention, faults: Faults) -> Array:
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
-    """Return timestamps without delay and clock drift."""
     return time_index(without_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)

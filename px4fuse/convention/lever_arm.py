@@ -13,18 +13,20 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import to_matrix
 
-# Minimum lever arm: m (twice the noise of good UWB), and σ; sources without one have up to 1.5
-MIN_ARM_M, MIN_ARM_SIGMAS = 0.2, 4.0
-CLIPPED_SIGMAS = 3.0  # residuals beyond are left out
+# Minimum lever arm (m) for a finding: twice the noise of good UWB
+MIN_ARM_M = 0.2
+# Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
+MIN_ARM_SIGMAS = 4.0
+# Maximum residual in σ of a sample that is used
+CLIPPED_SIGMAS = 3.0
+# Number of least squares fits with outlier removal
 ITERATIONS = 4
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, float, float] | None:
-    """Estimate the lever arm in addition to the one that is already subtracted.
+    """Estimate the lever arm (m) of the position sensor that EKF2's parameters do not contain.
 
-    Least squares of the second differences of the positions, with time offset and accelerometer
-    bias. Returns the position forward and right (m, body) with its standard deviation, or None if
-    it is not significant.
+    Returns the distances forward and right and their standard deviation; None if not significant.
     """
     inertial = read_inertial(flight)
     samples = track.samples[Columns.POSITION[:2]].dropna()
@@ -51,7 +53,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, flo
         covariance = np.linalg.pinv(rows.T @ rows) * sigma_m**2 * len(values) / count
         sigma = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual < CLIPPED_SIGMAS * sigma_m
-        time_s = time_s + fit[2]  # the rate's coefficient is the time by which they are early
+        time_s = time_s + fit[2]  # fit[2] is the time by which the timestamps are early
     forward_m, right_m = fit[:2].tolist()
     is_significant = np.hypot(forward_m, right_m) > max(MIN_ARM_M, MIN_ARM_SIGMAS * sigma)
     return (forward_m, right_m, sigma) if is_significant else None

@@ -14,7 +14,7 @@ Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to
 
 
 class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """Convention of the orientation of a position source.
+    """Order and frames of the orientation of a position source.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=Fal
 
 
 class Convention(Record, frozen=True, kw_only=True):
-    """Convention of the positions of a source, relative to IMU and attitude.
+    """Axes, unit and clock of the positions of a source, as sent.
 
     Attributes
     ----------

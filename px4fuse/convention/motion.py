@@ -32,21 +32,28 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
+# Standard gravity (m/s²)
 GRAVITY_M_S2 = 9.80665
-WINDOW_S = 2.0  # T
-GRID_S = 0.1  # interval of the second differences
-STEP_S = 0.02  # integration step of the IMU
+# Time T (s) of the second differences
+WINDOW_S = 2.0
+# Interval (s) between second differences
+GRID_S = 0.1
+# Integration step (s) of the IMU
+STEP_S = 0.02
+# Length (s) of the running mean that is subtracted from the second differences
 HIGH_PASS_S = 12.0
-# Length (s) of the running mean of the specific force that defines the vertical, applied twice. A
-# symmetric mean causes no delay; a causal correction towards gravity delays the result by 0.02 s
+# Length (s) of the running mean of the specific force, which defines the vertical. A symmetric mean
+# causes no delay
 LEVELLING_S = 40.0
+# Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-MIN_GAP_S = 0.35  # gap of a source
+# Minimum interval (s) of positions that is a gap
+MIN_GAP_S = 0.35
 
 
 @dataclass(frozen=True)
 class Inertial:
-    """IMU and attitude on a regular grid with interval ``STEP_S``.
+    """Specific force and attitude at a constant interval ``STEP_S``.
 
     Attributes
     ----------
@@ -68,13 +75,13 @@ class Inertial:
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro``, by the source of their heading."""
+        """Attitudes with the heading of EKF2 and with that of the gyroscopes."""
         return {"EKF2": replace_heading(self.gyro, heading(self.logged)), "gyroscopes": self.gyro}
 
 
 @dataclass(frozen=True)
 class SourceMotion:
-    """Second differences of the positions of a source, as sent, on a grid of ``GRID_S``."""
+    """Second differences of positions, at a constant interval ``GRID_S``."""
 
     time_s: Array
     table: Array
@@ -82,7 +89,7 @@ class SourceMotion:
 
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
-        """Interpolate positions; a grid point is valid if samples are near all three times."""
+        """Compute the second differences of positions; valid where samples are near."""
         window = round(WINDOW_S / GRID_S)
         at_s = grid_s[0] + GRID_S * np.arange(-window, len(grid_s) + window)
         is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
@@ -93,7 +100,7 @@ class SourceMotion:
 
 @dataclass(frozen=True)
 class ImuMotion:
-    """Second differences (m, NED) of the position, from the IMU.
+    """Second differences (m, NED) of the position, integrated from the IMU.
 
     Attributes
     ----------
@@ -113,7 +120,7 @@ class ImuMotion:
 
 
 def read_inertial(flight: Flight) -> Inertial | None:
-    """Integrate the gyroscopes of a flight to an attitude that no position affects.
+    """Integrate the gyroscopes of a flight to an attitude that EKF2 does not affect.
 
     None without IMU and attitude over at least 8 s.
     """
@@ -142,10 +149,10 @@ def read_inertial(flight: Flight) -> Inertial | None:
 
 
 def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
-    """Integrate rotations per step, without the gyro bias.
+    """Integrate the angular rates without the gyro bias.
 
-    The bias is the median over windows of 1 s of the difference to the logged rotation: resets of
-    the logged heading are outliers.
+    The bias is the median difference to the logged rotation, because a reset of the logged heading
+    is an outlier.
     """
     excess = angle_rad - to_vector(multiply(conjugate(logged[:-1]), logged[1:]))
     total = np.cumsum(excess, axis=0)
@@ -155,7 +162,7 @@ def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
 
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
-    """Correct the tilt: the mean specific force is vertical."""
+    """Correct the tilt so that the mean specific force is vertical."""
     mean = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
         mean = running_mean(mean, np.ones(len(mean), dtype=bool), round(LEVELLING_S / STEP_S))
@@ -189,7 +196,7 @@ def second_difference(position: Array, window: int) -> Array:
 
 
 def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
-    """Integrate the acceleration with an attitude (w, x, y, z), shape (n + 1, 4)."""
+    """Integrate the acceleration twice, with an attitude (w, x, y, z), shape (n + 1, 4)."""
     middle = attitude[1:] + attitude[:-1]
     body_to_ned = to_matrix(middle / np.linalg.norm(middle, axis=1, keepdims=True))
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
@@ -209,7 +216,7 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
-    """Rotate quaternions about the vertical to a given heading."""
+    """Rotate an attitude about the vertical to another heading."""
     half = np.unwrap(heading_rad - heading(attitude)) / 2.0
     zeros = np.zeros_like(half)
     return multiply(np.stack([np.cos(half), zeros, zeros, np.sin(half)], axis=-1), attitude)

@@ -17,9 +17,11 @@ from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
+# Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
+FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+# Quaternion (w, x, y, z) from ENU to NED
 ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-# Rotations of world and body to NED and FRD
+# Quaternions of the rotations of world and body to NED and FRD, by stated frames
 FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
     "FLU to ENU": (ENU_NED, FRD_FLU),
@@ -28,17 +30,29 @@ FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to ENU": (ENU_NED, IDENTITY),
 }
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
-MAX_COPY_DEG = 0.15  # copies differ by up to 0.03°, fused motion capture by more than 0.2°
+# Maximum median difference (°) of a copied attitude: copies differ by 0.03°, fused motion capture
+# by more than 0.2°
+MAX_COPY_DEG = 0.15
+# Tested delays (s) of a copied attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median tilt, heading difference if correct
-MIN_DIFFERENCE_DEG = 0.7  # noise of tilt and heading; smaller differences score equally
-SCORE_PER_S = 0.5  # log likelihood per second and factor e of the differences
-MIN_LOG_ODDS = 4.0  # to the best other convention
-MAX_SAMPLES, MIN_SAMPLES = 600, 20
+# Maximum median tilt difference (°) of a correct convention
+MAX_TILT_DEG = 6.0
+# Maximum median heading difference (°) of a correct convention
+MAX_HEADING_DEG = 12.0
+# Minimum difference (°) that lowers the score: noise of tilt and heading
+MIN_DIFFERENCE_DEG = 0.7
+# Decrease of the log likelihood per second of flight, if a difference is e times larger
+SCORE_PER_S = 0.5
+# Minimum log likelihood ratio to the second best convention
+MIN_LOG_ODDS = 4.0
+# Maximum number of samples that are compared with the attitude
+MAX_SAMPLES = 600
+# Minimum number of samples in flight
+MIN_SAMPLES = 20
 
 
 class Candidate(NamedTuple):
-    """Hypothesis on an orientation, its differences from the reference, and its log likelihood."""
+    """Assumed convention of an orientation, with its difference from the attitude."""
 
     convention: OrientationConvention
     heading_difference_deg: float
@@ -46,14 +60,14 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames; ENU and NWU differ only by a rotation about the vertical."""
+        """Order and frames; ENU and NWU are equal, because they differ only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
     inertial: Inertial, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine the convention of an orientation.
+    """Determine order and frames of an orientation.
 
     Parameters
     ----------
@@ -109,7 +123,7 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 def _make_candidate(
     time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
-    """Convert an orientation by a hypothesis and compare it with the reference."""
+    """Convert an orientation by an assumed convention and compare it with the attitude."""
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
     attitude = multiply(to_attitude(sent, convention), turn)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from px4fuse.convention.axes import UNITS
 from px4fuse.convention.model import Axes, Direction, Unit
 
-# In this order, opposite directions are symmetric about the middle
+# Directions in such an order that the reversed order contains the opposite directions
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {
@@ -27,7 +27,7 @@ def with_opposites(axes: Axes) -> list[Direction]:
 
 
 def axes_as_sent(axes: Axes, frame: str) -> Axes:
-    """Return the directions of x, y, z of a file whose positions were converted from a frame.
+    """Return the true directions of x, y, z in a file that was read in another frame.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def format_axes(axes: Sequence[str], unit: str) -> str:
 
 
 def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) -> tuple[str, str]:
-    """Return the fault of axes that are not the stated frame, and the action.
+    """Describe wrong axes and the action.
 
     >>> describe_axes(("east", "north", "up"), "NED", is_mirrored=False, is_file=True)
     ('ENU read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
@@ -80,7 +80,7 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
 def describe_unit(
     unit: Unit, positions: str, stated: str = "metres", *, is_file: bool
 ) -> tuple[str, str]:
-    """Return the fault of a unit other than the stated one, and the action.
+    """Describe a wrong unit and the action.
 
     >>> describe_unit("cm", "positions", is_file=True)
     ('positions are in centimetres, not in metres', 'Run again with --position-unit cm.')
@@ -93,7 +93,7 @@ def describe_unit(
 
 
 def describe_conversion(frames: str) -> str:
-    """Return the action for an orientation in other frames.
+    """Describe the conversion of an orientation to FRD and NED.
 
     >>> describe_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'

@@ -31,7 +31,7 @@ const Card = (() => {
       if (shown.hasChildNodes() && shown.dataset.axis === undefined) figures.set(main, shown);
       shown.replaceWith(figures.get(axis));
     }
-    /* Move the KF marks to the ratios with the changed settings; hollow marks keep the analysed ratios */
+    /* Move the KF symbols to the ratios with the changed settings; hollow symbols keep the analysed ratios */
     function moveMarks(now, axis, isChanged) {
       const figure = query("#card figure");
       now.forEach((verdict, i) => {

@@ -26,23 +26,22 @@ from px4fuse.filter.settings import (
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, map_grids
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 
-Data = dict[str, Any]  # data of the page, which become JSON
+# Data of the page, which become JSON
+Data = dict[str, Any]
 # Range of the time offset slider (s) below and above the analysed time offset
 OFFSET_HALF_RANGE_S = 0.6
-RUNNING_MEAN_COUNT = 30  # number of innovations in the running RMS of innovation ÷ √S
-MAX_TRACK_POINTS = 2000  # maximum number of drawn points of the track on the map
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> Data:
-    """Return all data of one flight for JSON; arrays are replaced by their index in the packer.
+    """Return all data of one flight for JSON; the packer contains the arrays.
 
     Parameters
     ----------
@@ -65,7 +64,6 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
             for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _map_data(analysis),
-        "plan": _track_data(analysis, packer),
         "events": {
             "gap": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -97,7 +95,6 @@ def ranges() -> Data:
         "sigma-z": list(SIGMA_Z_RANGE_M),
         "dt": list(DT_RANGE_S),
         "lesson": _settings_data(Settings()),
-        "running": RUNNING_MEAN_COUNT,
         "bands": SIGMA_RATIO_BANDS,
         "ends": list(AXIS_ENDS),
         "marks": MARK_PATHS,
@@ -154,7 +151,7 @@ def _imu_data(comparison: Comparison, packer: Packer) -> Data | str:
 
 
 def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """Return the slice of IMU samples in the segment, with one more sample at each end."""
+    """Return the IMU samples of the segment as a slice, with one more sample at each end."""
     segment, time = comparison.segment, acceleration.time_s
     low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
     high = int(np.searchsorted(time, segment.end_s)) + 1
@@ -203,7 +200,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
     }
 
 
-def _nis_bands(count: int, packer: Packer) -> list[int]:
+def _nis_bands(count: int, packer: Packer) -> list[dict[str, int]]:
     """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
 
     The time offset moves measurements into or out of the segment, so their number can change.
@@ -281,18 +278,16 @@ def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
     }
 
 
-def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
-    """Pack the times and some columns of a frame; return their indices."""
+def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[dict[str, int]]:
+    """Pack the times and some columns of a frame."""
     values = [packer.add(table[column].to_numpy(), COARSE_SCALE) for column in columns]
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
 def _map_data(analysis: Analysis) -> Data:
-    """Return limits and estimate of each likelihood map, or the reason why it is missing."""
+    """Return the estimates of each likelihood map, or the reason why the map is missing."""
     return {
         name: {
-            "sigmaA": map_grids(axis_tuning)[0][[0, -1]].tolist(),
-            "sigmaZ": map_grids(axis_tuning)[1][[0, -1]].tolist(),
             "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
             "count": axis_tuning.count,
         }
@@ -300,16 +295,6 @@ def _map_data(analysis: Analysis) -> Data:
         else axis_tuning.reason
         for name, axis_tuning in analysis.tuning.items()
     }
-
-
-def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
-    """Pack time, north and east of the source's track, or return the reason why it is missing."""
-    samples = cut_to_segment(comparison.source.samples, comparison.segment)
-    track = samples[Columns.POSITION[:2]].dropna()
-    if not len(track):
-        return "the source has no horizontal position"
-    sampled = track.iloc[:: max(1, -(-len(track) // MAX_TRACK_POINTS))]
-    return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
 def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:

@@ -96,7 +96,6 @@ const Engine = (() => {
   }
 
   /* Set row i of all columns */
-  /* Set row i of all columns */
   const write = (columns, i, values) => { for (const name in values) columns[name][i] = values[name]; };
   /* Run KF (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
   function replay(flight, axis, settings) {

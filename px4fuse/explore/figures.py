@@ -1,5 +1,6 @@
 """Bokeh plots of the explore page without data, which the script of the page adds."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -15,13 +16,15 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import SIGMA_RATIO_BANDS
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Record, table
 from px4fuse.explore.data import Data
 from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 
-Style = dict[str, Any]  # options of a drawing function of Bokeh
+# Options of a drawing function of Bokeh
+Style = dict[str, Any]
+# Columns of the data sources, which the script of the page fills as far as a plot needs them
+COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right text"
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
 # the report
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
@@ -32,17 +35,29 @@ HOLLOW_MARKER: Style = {"fill_color": None, "line_color": "black"}
 ARROW_MARKER: Style = {"angle": "turn", "marker": "triangle"}
 # Band around the values of a consistent filter
 CONSISTENT_BAND: Style = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
-# Innovation ÷ √S: limit of 95 % of the values of a consistent filter, and half the plotted range
-NORMAL_LIMIT, HALF_NORMAL_RANGE = 2.0, 4.6
-# Left border of the plots and, for its longer labels, of the event plot (pixels)
-LEFT_BORDER, EVENT_BORDER = 50, 82
+GAP_BAND: Style = {
+    "level": "underlay",
+    "fill_color": None,
+    "line_color": None,
+    "hatch_pattern": "/",
+    "hatch_color": "#888888",
+    "hatch_alpha": 0.6,
+}
+# Limit of innovation ÷ √S that contains 95 % of the values of a consistent filter
+NORMAL_LIMIT = 2.0
+# Upper end of the plot of innovation ÷ √S; the lower end has the opposite sign
+NORMAL_END = 4.6
+# Width (pixels) left of the axis of a plot
+LEFT_BORDER = 50
+# Width (pixels) left of the axis of the event plot, which has longer labels, and of the plot above
+EVENT_BORDER = 82
 STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Upper end of the colours of the likelihood map (standard deviations): √(2 · (ln L_max − ln L))
+# Distance from the maximum, √(2 · (ln L_max − ln L)), of the palest colour of the likelihood map
 MAP_SIGMAS = 6.0
 
 
@@ -60,13 +75,19 @@ class Plot(Record, frozen=True):
     unit: str = ""
 
 
+class View(Record, frozen=True):
+    """View of the page, with the titles of its plots."""
+
+    title: str
+    plots: Mapping[str, str]
+
+
 class Figures(Record, frozen=True):
-    """Plots of ``figures.toml``: titles, columns of the sources, lines and colours."""
+    """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]
     map_colours: list[str]
-    panels: dict[str, str]
-    sources: dict[str, str]
+    views: dict[str, View]
     plots: dict[str, Plot]
 
 
@@ -89,10 +110,9 @@ def document_json(data: Data, analysis: Analysis) -> tuple[Any, dict[str, str]]:
     plots |= {
         "strip": _event_plot(data, time_range),
         "map": _likelihood_map(analysis),
-        "plan": _track_plot(),
         "step": _phase_plot(),
     }
-    with document.models.freeze():  # faster: Bokeh collects the models of all plots once
+    with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
@@ -118,34 +138,33 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             name,
             215,
             x_range=time_range,
-            y_range=_page_range(),
             y_axis_type=plot.scale,
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
             lod_threshold=None,
-            min_border_left=LEFT_BORDER,
+            min_border_left=EVENT_BORDER if name == "position" else LEFT_BORDER,
         )
         if name == "position":
-            _draw_dots(fig, sources["measured"], 3, name="measured")
-            _draw_dots(fig, sources["beyond"], 9, name="measured", **ARROW_MARKER)
+            _draw_dots(fig, sources["measured"], "t z", 3, name="measured")
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "error":
             fig.varea(
                 "t", "minus", "plus", source=sources["error"], fill_alpha=0.25, name="kf_band"
             )
-        if name == "running":
-            low, high = SIGMA_RATIO_BANDS["source"]
-            fig.add_layout(BoxAnnotation(bottom=low, top=high, **CONSISTENT_BAND))
+        lines: list[Any] = []
         for source, column, style_name, hover_name in plot.lines:
             if style_name in missing_kinds:
                 continue
             line_renderer = fig.line("t", column, source=sources[source], **STYLES[style_name])
+            lines.append(line_renderer)
             if hover_name:
                 _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
+        if name == "error":  # the 2σ band is much wider at the initial state
+            fig.y_range.renderers = lines
         _add_cursor(fig, name="cursor")
-        for low, high, style in _event_bands(data):
-            fig.add_layout(BoxAnnotation(left=low, right=high, level="underlay", **style))
+        for low, high in data["events"]["gap"]:
+            fig.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
     return plots
 
 
@@ -156,24 +175,24 @@ class _Sources(dict[str, ColumnDataSource]):
         self.plot = plot
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _empty_source(f"{self.plot}:{name}", FIGURES.sources[name])
+        self[name] = _empty_source(f"{self.plot}:{name}")
         return self[name]
 
 
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
     """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
-    fig.y_range = Range1d(start=-HALF_NORMAL_RANGE, end=HALF_NORMAL_RANGE)
+    fig.y_range = Range1d(start=-NORMAL_END, end=NORMAL_END)
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
-    kf_dots = _draw_dots(fig, sources["updates"], 4, name="kf")
+    kf_dots = _draw_dots(fig, sources["updates"], "t x", 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
-    _draw_dots(fig, sources["beyond"], 9, name="kf", **ARROW_MARKER)
+    _draw_dots(fig, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
         square: Style = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(fig, sources["fused"], 4, **square)
-        rejected_dots = _draw_dots(fig, sources["rejected"], 7, **square, **HOLLOW_MARKER)
+        fused_dots = _draw_dots(fig, sources["fused"], "t x", 4, **square)
+        rejected_dots = _draw_dots(fig, sources["rejected"], "t x", 7, **square, **HOLLOW_MARKER)
         _add_hover(fig, fused_dots, ("EKF2", "@x{0.00}"))
         _add_hover(fig, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
-        _draw_dots(fig, sources["beyond_ekf2"], 9, name="ekf2", **ARROW_MARKER)
+        _draw_dots(fig, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
@@ -195,38 +214,18 @@ def _add_cursor(fig: Any, **options: Any) -> None:
 
 
 def _page_range(name: str | None = None) -> Range1d:
-    """Return a plot range that the page's script sets."""
+    """Return a plot range that the script of the page sets."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _empty_source(name: str, columns: str) -> ColumnDataSource:
-    """Return an empty source that the page's script fills; `columns` are separated by blanks."""
-    empty: Data = {column: [] for column in columns.split()}
-    return ColumnDataSource(empty, name=f"{name}-source")
-
-
-def _event_bands(data: Data) -> list[tuple[float, float, Style]]:
-    """Return start, end (s) and style of shaded flight modes, ground times, gaps and dropouts."""
-    grey: Style = {"fill_color": "#888888", "line_color": None}
-    hatched: Style = {
-        "hatch_pattern": "/",
-        "hatch_color": "#888888",
-        "hatch_alpha": 0.6,
-        "fill_alpha": 0.05,
-    }
-    events = data["events"]
-    sand: Style = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
-    return [
-        *((low, high, sand) for low, high, _ in events["modes"][1::2]),
-        *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
-        *((low, high, grey | hatched) for low, high in events["gap"]),
-        *((low, high, grey | {"fill_alpha": 0.45}) for low, high in events["dropout"]),
-    ]
+def _empty_source(name: str) -> ColumnDataSource:
+    """Return an empty source with all columns of the page, which the script of the page fills."""
+    return ColumnDataSource({column: [] for column in COLUMNS.split()}, name=f"{name}-source")
 
 
 def _event_plot(data: Data, time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
-    source = _empty_source("strip", FIGURES.sources["events"])
+    source = _empty_source("strip")
     rows = FIGURES.event_rows if _has_kind(data, "ekf2") else FIGURES.event_rows[2:]
     fig = _figure(
         "strip",
@@ -268,12 +267,11 @@ def _likelihood_map(analysis: Analysis) -> Any:
         250,
         x_axis_type="log",
         y_axis_type="log",
-        x_range=_page_range(),
-        y_range=_page_range(),
         tools="tap",
         x_axis_label="SIGMA_A (m/s²)",
         y_axis_label="SIGMA_Z (m)",
     )
+    fig.x_range.only_visible = fig.y_range.only_visible = True
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
     for name, axis_tuning in analysis.tuning.items():
         if isinstance(axis_tuning, AxisTuning):
@@ -285,49 +283,25 @@ def _likelihood_map(analysis: Analysis) -> Any:
             image = np.sqrt(2.0 * drop.T).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    trail = _empty_source("trail", "x y")
-    best_point = _empty_source("best", "x y")
-    point = _empty_source("point", "x y")
+    best_point = _empty_source("best")
+    point = _empty_source("point")
     white: Style = {"line_color": "white"}
-    fig.line("x", "y", source=trail, line_width=1.2, name="ekf2")
-    _draw_dots(fig, trail, 3, name="ekf2")
-    _draw_dots(fig, best_point, 13, marker="cross", line_width=2.5, **white)
-    _draw_dots(fig, point, 12, fill_color="darkorange", line_width=2.0, **white)
+    _draw_dots(fig, best_point, "x y", 13, marker="cross", line_width=2.5, **white)
+    _draw_dots(fig, point, "x y", 12, fill_color="darkorange", line_width=2.0, **white)
     return fig
 
 
-def _draw_dots(fig: Any, source: ColumnDataSource, size: int, **style: Any) -> Any:
-    """Draw dots without edge lines; x and y are the last two columns of the source."""
-    x, y = source.column_names[-2:]
+def _draw_dots(fig: Any, source: ColumnDataSource, columns: str, size: int, **style: Any) -> Any:
+    """Draw two columns of the source as dots without edge lines, for example "t z"."""
+    x, y = columns.split()
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Return start and length of an image on a logarithmic axis from the centres of its pixels."""
+    """Return start and length of an image along a logarithmic axis; ``values``: pixel centres."""
     half_pixel = float(np.sqrt(values[1] / values[0]))
     start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
     return start, end - start
-
-
-def _track_plot() -> Any:
-    """Make the map of the position source; a box on it sets the time range of all plots."""
-    fig = _figure(
-        "plan",
-        250,
-        match_aspect=True,
-        tools="box_select,tap",
-        active_drag="box_select",
-        x_axis_label="east (m)",
-        y_axis_label="north (m)",
-    )
-    track = _empty_source("plan", "t east north")
-    shown_source = _empty_source("shown", "east north")
-    cursor = _empty_source("here", "east north")
-    fig.line("east", "north", source=track, name="measured")
-    _draw_dots(fig, track, 3, nonselection_fill_alpha=0.6, name="measured")
-    _draw_dots(fig, shown_source, 4, name="kf")
-    _draw_dots(fig, cursor, 12, marker="circle_x", line_width=2.0, name="ekf2", **HOLLOW_MARKER)
-    return fig
 
 
 def _phase_plot() -> Any:
@@ -343,11 +317,11 @@ def _phase_plot() -> Any:
     )
     fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
     _add_cursor(fig, name="measurement", line_dash=[2, 2])
-    trail = _empty_source("trail-means", "p v")
-    point_before, current_point = _empty_source("before", "p v"), _empty_source("now", "p v")
-    mean = _empty_source("mean", "p v")
+    trail = _empty_source("trail-means")
+    point_before, current_point = _empty_source("before"), _empty_source("now")
+    mean = _empty_source("mean")
     fig.line("p", "v", source=trail, name="measured")
     fig.line("p", "v", source=point_before, **KF_LINE | {"line_dash": [6, 3]})
     fig.patch("p", "v", source=current_point, fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, mean, 7, name="kf")
+    _draw_dots(fig, mean, "p v", 7, name="kf")
     return fig

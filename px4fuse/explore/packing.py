@@ -12,15 +12,18 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Steps per unit: 1.5e-11 m, m/s or s, 1 % of the tolerance between the page's KF and Python's
+# Steps per unit for values that KF uses: one step is 1.5e-11 m, m/s or s, which is 1 % of the
+# tolerance between KF in the page and KF in Python
 FINE_SCALE = 2.0**36
-COARSE_SCALE = 1e6  # steps per unit for values that are only drawn or averaged
-MAX_EXACT_INTEGER = 2.0**52  # integers up to this are exact in JavaScript (doubles)
+# Steps per unit for values that are only drawn or averaged
+COARSE_SCALE = 1e6
+# Largest integer that JavaScript represents exactly, with a margin of a factor of two
+MAX_EXACT_INTEGER = 2.0**52
 
 
 @dataclass
 class Packer:
-    """Encoder of arrays; the data of the page refer to an array by its index.
+    """Encoder of arrays; the data of the page contain ``{"array": index}`` for each array.
 
     ``specs`` contains length, number of byte planes and steps per unit of each array.
     """
@@ -28,8 +31,8 @@ class Packer:
     specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
 
-    def add(self, values: Array, scale: float = FINE_SCALE) -> int:
-        """Add one array of finite numbers and return its index.
+    def add(self, values: Array, scale: float = FINE_SCALE) -> dict[str, int]:
+        """Add one array of finite numbers and return its placeholder for the data of the page.
 
         Parameters
         ----------
@@ -48,9 +51,9 @@ class Packer:
         plane_count = max(1, (int(zigzag.max(initial=0)).bit_length() + 7) // 8)
         self._bytes.append(zigzag.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes())
         self.specs.append((len(values), plane_count, scale))
-        return len(self.specs) - 1
+        return {"array": len(self.specs) - 1}
 
-    def add_times(self, time_s: Array) -> int:
+    def add_times(self, time_s: Array) -> dict[str, int]:
         """Add times (s), in whole microseconds if they are multiples of them."""
         is_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
         return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)

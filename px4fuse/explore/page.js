@@ -1,44 +1,22 @@
 /* Main script of the page: runs KF with the settings and draws plots and numbers. */
 const Explore = (async () => {
   const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // maximum number of drawn points of a line, also while a slider is dragged
-  const DRAG_PAUSE_MS = 150;
-  const NARROW = matchMedia("(max-width: 60rem)");
-  const readJson = (id) => JSON.parse($(id).textContent);
-  const content = readJson(`content${Practice.suffix}`), ranges = content.ranges;
-  if (typeof DecompressionStream === "undefined") {
-    $("problem").textContent = "This browser is too old for this page. Use a browser of 2023 or later.";
-    $("problem").hidden = false;
-    return null;
-  }
-
+  const read = (id) => $(`${id}${Practice.suffix}`).textContent;
   // ------------------------------------------------------------------ the flight's data
-  const arrays = await Engine.unpack($(`arrays${Practice.suffix}`).textContent, content.packed);
-  const arraysAt = (indices) => indices.map((index) => arrays[index]);
-  const { imu, plan, axes } = content.flight;
-  const flight = {
-    ...content.flight,
-    imu: isText(imu) ? imu : { ...imu, time: arrays[imu.time] },
-    plan: isText(plan) ? plan : arraysAt(plan),
-    axes: axes.map((axis) => ({
-      ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: arraysAt(axis.bands),
-      integral: arrays[axis.integral],
-      ekf2: isText(axis.ekf2) ? axis.ekf2 : {
-        ...axis.ekf2, state: arraysAt(axis.ekf2.state), variance: arraysAt(axis.ekf2.variance),
-        innovations: arraysAt(axis.ekf2.innovations),
-      },
-      truth: isText(axis.truth) ? axis.truth : { p: arraysAt(axis.truth.p), v: axis.truth.v && arraysAt(axis.truth.v) },
-    })),
-  };
+  const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
+  const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
+  const { flight, ranges, places } = JSON.parse(read("content"), withArrays);
+  const { imu, axes } = flight;
   // ------------------------------------------------------------------ settings
-  // `log`: ends of a logarithmic slider (without it: linear); `likely`: maximum-likelihood estimate
+  // `log`: ends of a logarithmic slider; a slider without `log` is linear. `likely`: maximum-likelihood estimate
   const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise", likely: () => mapNow().likely?.[0] },
     { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => mapNow().likely?.[1] },
     { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
-      hint: "added to timestamps", isMore: true, likely: () => flight.offset.likely },
-    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step", isMore: true },
+      hint: "added to timestamps", likely: () => flight.offset.likely },
+    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
@@ -62,28 +40,28 @@ const Explore = (async () => {
     return Math.round(clamp(distance / (high - low || 1), 0, 1) * TICKS);
   };
   for (const setting of SETTINGS) {
-    // on a phone, DT and time offset are only in the opened settings sheet
-    const box = make("div", "", setting.isMore ? "setting more" : "setting");
+    const box = make("div", "", "setting");
     const label = make("label", `${setting.title} `, { htmlFor: `${setting.id}-value` });
-    label.append(make("small", `${setting.unit}, ${setting.hint}`));
+    label.append(make("small", `${setting.unit}, ${setting.hint} `), setting.estimate = make("small"));
     setting.number = make("input", "", { type: "number", id: `${setting.id}-value`, step: "any" });
     setting.slider = make("input", "", {
       type: "range", id: setting.id, min: 0, max: TICKS, step: 1, ariaLabel: setting.title });
+    setting.slider.setAttribute("list", `${setting.id}-likely`);
+    setting.tick = make("option");
+    const ticks = make("datalist", "", { id: `${setting.id}-likely` });
+    ticks.append(setting.tick);
     setting.slider.addEventListener("input", () => {
       set({ [setting.key]: fromSlider(setting, Number(setting.slider.value)) }, true);
     });
+    setting.slider.addEventListener("change", () => show());
     setting.number.addEventListener("change", () => {
       const text = setting.number.value, [low, high] = limits(setting);
       if (isWithinLimits(setting, text)) return set({ [setting.key]: Number(text) });
       showMessage(`${setting.title} must be between ${low} and ${high} ${setting.unit}.`);
       show();
     });
-    setting.best = make("div", "", "best");
-    box.append(label, setting.number, setting.slider, setting.best);
-    if (setting.key === "offset" && fixedReason) {
-      setting.number.disabled = setting.slider.disabled = true;
-      box.append(make("p", fixedReason, "note"));
-    }
+    box.append(label, setting.number, setting.slider, ticks);
+    if (setting.key === "offset" && fixedReason) box.append(make("p", fixedReason, "note"));
     $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
@@ -104,15 +82,10 @@ const Explore = (async () => {
   /* Mark the maximum-likelihood estimate on the track of a slider */
   function markLikely(setting) {
     const value = setting.likely?.() ?? null;
-    setting.best.hidden = value === null;
-    if (value === null) return;
-    const percent = 100 * toSlider(setting, value) / TICKS, line = make("i");
-    const label = make("small", `maximum-likelihood estimate ${round(value, 3)}`);
-    line.style.left = label.style.left = `${percent}%`;
-    label.style.transform = `translateX(${-percent}%)`;
-    setting.best.replaceChildren(line, label);
+    setting.tick.value = value === null ? "" : toSlider(setting, value);
+    setting.estimate.textContent = value === null ? "" : `(maximum likelihood ${round(value, 3)})`;
   }
-  const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
+  const axisNow = () => axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
   const mapNow = () => flight.maps[axisNow().map] ?? "it was not computed for this axis";
 
@@ -132,20 +105,12 @@ const Explore = (async () => {
   });
 
   /* Change settings, re-run KF and draw; during a drag at most once per frame, with fewer points */
-  let isDrawing = false, isChangedSince = false, finalDraw = null;
+  let nextFrame = null;
   function set(changes, isDragged = false) {
     Object.assign(settings, changes);
     if ($("message").textContent) showMessage("");
-    clearTimeout(finalDraw);
-    if (!isDragged) return show();
-    finalDraw = setTimeout(show, DRAG_PAUSE_MS);
-    if (isDrawing) { isChangedSince = true; return; }
-    isDrawing = true;
-    show(true);
-    requestAnimationFrame(() => {
-      isDrawing = false;
-      if (isChangedSince) { isChangedSince = false; show(true); }
-    });
+    if (isDragged) nextFrame ??= requestAnimationFrame(() => show(true));
+    else show();
   }
 
   // ------------------------------------------------------------------ the address
@@ -166,101 +131,33 @@ const Explore = (async () => {
       else ignored.push(name);
     };
     for (const setting of SETTINGS) {
-      if (setting.key === "offset" && fixedReason) continue;
       take(setting.id, (text) => isWithinLimits(setting, text), (text) => { settings[setting.key] = Number(text); });
     }
     take("axis", (name) => names.includes(name), (name) => { settings.axis = name; });
     take("input", (name) => name === "zero" || (name === "imu" && hasImu), (name) => { settings.input = name; });
-    take("view", isView, (name) => open(name, false));
+    take("view", (name) => viewButtons.some(({ value }) => value === name), (name) => open(name, false));
     take("measurement", (text) => Number.isInteger(Number(text)) && text > 0,
       (text) => { selected.measurement = text - 1; });
     if (ignored.length) showMessage(`Invalid values in the page address are ignored: ${ignored.join(", ")}.`);
   }
 
   // ------------------------------------------------------------------ views
-  // Titles of the tabs: plots (each has a tab on a phone), groups of plots on a wide screen, and other views
-  const PLOTS = { innovation: "Innovations", error: "Error", sigma_p: "σ position", sigma_v: "σ velocity",
-    position: "Position", strip: "Events", velocity: "Velocity", gain: "Gain", running: "Running RMS" };
-  const GROUPS = { errors: ["Errors", ["innovation", "error"]],
-    sigma: ["σ", ["sigma_p", "sigma_v"]], track: ["Position", ["position", "strip"]],
-    speed: ["Velocity", ["velocity"]], gains: ["Gain", ["gain", "running"]] };
-  const BOXES = { numbers: "Statistics", step: "Step by step", map: "Likelihood" };
-  const hasPlot = (name) => query(`[data-plot=${name}]`) !== null;
-  const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(BOXES, name)
-    || (Object.hasOwn(PLOTS, name) && hasPlot(name));
+  const PLOTS = queryAll(".plot > div").map(({ id }) => id);
+  const viewButtons = queryAll("[name=view]");
   let view = "errors";
-  /* Tab of a view; on a narrow screen each plot has a separate tab */
-  function tabOf(name) {
-    if (name in BOXES) return name;
-    if (NARROW.matches) return name in GROUPS ? GROUPS[name][1][0] : name;
-    return Object.keys(GROUPS).find((group) => group === name || GROUPS[group][1].includes(name));
-  }
-  const visiblePlots = () => view in BOXES ? [] : view in GROUPS ? GROUPS[view][1] : [view];
-  const isVisible = (name) => name === "plan" || name === "step" ? view === "step" : name === view || visiblePlots().includes(name);
-  function drawTabs() {
-    const plots = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => hasPlot(name))
-      : Object.entries(GROUPS).map(([name, [title]]) => [name, title]);
-    $("tabs").replaceChildren(...[...plots, ...Object.entries(BOXES)].map(([name, title]) => {
-      const tab = make("button", title, { id: `tab-${name}`, role: "tab" });
-      tab.setAttribute("aria-controls", name in BOXES ? `view-${name}` : "view-plots");
-      tab.addEventListener("click", () => open(name));
-      return tab;
-    }));
-  }
-  /* Show a plot, a group of plots or another view */
+  const isVisible = (plot) => $(plot)?.closest("[data-view]").dataset.view === view;
   function open(name, draw = true) {
-    view = tabOf(name);
-    for (const tab of $("tabs").children) {
-      const isOpen = tab.id === `tab-${view}`;
-      tab.ariaSelected = String(isOpen);
-      tab.tabIndex = isOpen ? 0 : -1;
-      if (isOpen && draw) tab.scrollIntoView({ block: "nearest", inline: "nearest" });
-    }
-    const plots = visiblePlots();
-    $("view-plots").hidden = !plots.length;
-    $("view-plots").setAttribute("aria-labelledby", `tab-${view}`);
-    for (const figure of queryAll("[data-plot]")) figure.hidden = !plots.includes(figure.dataset.plot);
-    for (const box of Object.keys(BOXES)) $(`view-${box}`).hidden = box !== view;
+    view = name;
+    for (const button of viewButtons) button.checked = button.value === name;
+    for (const box of queryAll("[data-view]")) box.hidden = box.dataset.view !== name;
     if (draw) { axisShown = null; show(); }
   }
-  $("tabs").addEventListener("keydown", (event) => {
-    const all = [...$("tabs").children], current = all.findIndex((tab) => tab.tabIndex === 0);
-    const to = { ArrowRight: current + 1, ArrowLeft: current - 1, Home: 0, End: all.length - 1 }[event.key];
-    if (to === undefined) return;
-    const tab = all[(to + all.length) % all.length];
-    tab.click();
-    tab.focus();
-    event.preventDefault();
-    event.stopPropagation();
-  });
-  NARROW.addEventListener("change", () => {
-    drawTabs();
-    setHeights();
-    open(view);
-  });
-  const sheet = query("aside");
-  new ResizeObserver(() => document.body.style.setProperty("--sheet", `${sheet.offsetHeight}px`)).observe(sheet);
-  /* On a phone the settings are a sheet at the bottom; a swipe or a button opens and closes it */
-  function openSheet(isOpen) {
-    sheet.classList.toggle("open", isOpen);
-    $("handle").ariaExpanded = String(isOpen);
-    $("all").textContent = isOpen ? "Less ▾" : "All ▴";
-  }
-  const isSheetOpen = () => $("handle").ariaExpanded === "true";
-  let swipedFrom = null;
-  for (const id of ["handle", "all"]) onClick(id, () => openSheet(!isSheetOpen()));
-  sheet.addEventListener("touchstart", (event) => {
-    swipedFrom = event.target.matches("input") ? null : event.touches[0].clientY;
-  }, { passive: true });
-  sheet.addEventListener("touchend", (event) => {
-    const by = swipedFrom === null ? 0 : event.changedTouches[0].clientY - swipedFrom;
-    if (Math.abs(by) > 30) openSheet(by < 0);
-  });
+  for (const button of viewButtons) button.addEventListener("change", () => open(button.value));
 
   // ------------------------------------------------------------------ Bokeh
   Bokeh.logger.set_level("off");
-  await Bokeh.embed.embed_items({ page: readJson(`document${Practice.suffix}`) }, [
-    { docid: "page", roots: content.places, root_ids: Object.keys(content.places) }]);
+  await Bokeh.embed.embed_items({ page: JSON.parse(read("document")) }, [
+    { docid: "page", roots: places, root_ids: Object.keys(places) }]);
   const page = Bokeh.documents[0];
   const models = new Map();
   const model = (name) => {
@@ -268,22 +165,16 @@ const Explore = (async () => {
     return models.get(name);
   };
   const setSource = (name, columns) => { model(`${name}-source`).data = columns; };
-  /* Draw columns, reduced to a few thousand points, in each visible plot with this source; add them to `drawn` */
-  function drawSource(drawn, name, columns, keys) {
-    drawn[name] = decimate(columns, keys);
-    for (const plot of visiblePlots()) {
+  /* Draw columns, reduced to a few thousand points, in each visible plot with this source */
+  function drawSource(name, columns, keys) {
+    const data = decimate(columns, keys);
+    for (const plot of PLOTS.filter(isVisible)) {
       const source = model(`${plot}:${name}-source`);
-      if (source !== null) source.data = drawn[name];
+      if (source !== null) source.data = data;
     }
   }
   const timeRange = model("time");
-  const figures = Object.keys(PLOTS).map(model).filter(Boolean);
-  function setHeights() {
-    for (const plot of figures) if (plot.name !== "strip") plot.height = NARROW.matches ? 175 : 205;
-    model("position").min_border_left = NARROW.matches ? 50 : 82; // same left border as the event plot below it
-  }
-  setHeights();
-
+  const figures = PLOTS.map(model);
   /* Rows within the visible time range; of long series only minimum and maximum of `keys` in each time bin */
   let pointLimit = MAX_POINTS;
   function decimate(columns, keys) {
@@ -292,7 +183,7 @@ const Explore = (async () => {
     const last = t.findIndex((time) => time >= timeRange.end), to = last < 0 ? n : Math.min(last + 2, n);
     const names = Object.keys(columns), out = {};
     if (to - from <= pointLimit) {
-      for (const name of names) out[name] = columns[name].subarray(from, to);
+      for (const name of names) out[name] = columns[name].slice(from, to);
       return out;
     }
     const bins = Math.floor(pointLimit / 2 / keys.length), indices = [];
@@ -310,42 +201,22 @@ const Explore = (async () => {
     for (const name of names) out[name] = Float64Array.from(indices, (i) => columns[name][i]);
     return out;
   }
-  const EMPTY = new Float64Array(0);
   const table = (names, columns) => Object.fromEntries(
-    names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
+    names.map((name, i) => [name, columns[i] ?? []]));
   const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
-  /* Set the vertical range of a visible plot */
-  function setRange(name, ends, log = false) {
-    const range = isVisible(name) ? model(name)?.y_range : undefined;
-    if (!range) return;
-    let [low, high] = ends();
-    if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
-    const edge = log ? 1.15 : 0.06 * (high - low);
-    [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
-  }
-  /* Draw arrow heads at the edge for values outside the plot */
-  function drawOutsideArrows(drawn) {
-    const points = (column, ...names) => names.flatMap((name) =>
-      Array.from(drawn[name]?.t ?? [], (t, i) => [t, drawn[name][column][i]]));
-    for (const [plot, name, all] of [["position", "beyond", points("z", "measured")],
-      ["innovation", "beyond", points("x", "updates")],
-      ["innovation", "beyond_ekf2", points("x", "fused", "rejected")]]) {
-      const source = isVisible(plot) ? model(`${plot}:${name}-source`) : null;
-      if (source === null) continue;
-      const { start: low, end: high } = model(plot).y_range, inside = 0.035 * (high - low);
-      const out = all.filter(([, y]) => y < low || y > high);
-      source.data = { t: out.map(([t]) => t), y: out.map(([, y]) => y > high ? high - inside : low + inside),
-        turn: out.map(([, y]) => y > high ? 0 : Math.PI) };
+  /* Draw arrow heads at the edge for innovations outside the plot */
+  function drawOutsideArrows() {
+    const { end } = model("innovation").y_range;
+    for (const [arrows, ...names] of [["beyond", "updates"], ["beyond_ekf2", "fused", "rejected"]]) {
+      const sources = names.map((name) => model(`innovation:${name}-source`)).filter(Boolean);
+      const points = sources.flatMap(({ data: { t, x } }) => Array.from(t, (time, i) => [time, x[i]]));
+      const out = points.filter(([, x]) => Math.abs(x) > end);
+      if (sources.length) {
+        setSource(`innovation:${arrows}`, { t: out.map(([t]) => t), y: out.map(([, x]) => 0.93 * end * Math.sign(x)),
+          turn: out.map(([, x]) => x > 0 ? 0 : Math.PI) });
+      }
     }
-  }
-  function extent(...columns) {
-    let low = Infinity, high = -Infinity;
-    for (const column of columns) for (const y of column) {
-      if (y < low) low = y;
-      if (y > high) high = y;
-    }
-    return [low, high];
   }
 
   // ------------------------------------------------------------------ KF run and its numbers
@@ -393,13 +264,11 @@ const Explore = (async () => {
     }
     return kf?.ekf2P ? `The position difference KF − EKF2 along ${axis.called} is ${Card.formatMetres(kf.ekf2P)} RMS.` : "";
   }
-  let analysedNumbers = null;
+  const analysedNumbers = (() => {
+    const axis = axes.find(({ name }) => name === flight.main), run = Engine.replay(flight, axis, flight.settings);
+    return run && numbers(axis, run);
+  })();
   function drawCard(result) {
-    if (analysedNumbers === null) {
-      const axis = flight.axes.find(({ name }) => name === flight.main);
-      const run = Engine.replay(flight, axis, { ...settings, ...flight.settings });
-      analysedNumbers = run === null ? {} : numbers(axis, run);
-    }
     const now = card.verdicts(result.numbers);
     card.moveMarks(now, result.axis, isChanged());
     card.showTexts(now, effect(result), isChanged());
@@ -460,115 +329,77 @@ const Explore = (async () => {
       add(i, steps, i);
     }
     const rows = { t: updates.time, x: updates.nu.map((nu, i) => nu / Math.sqrt(updates.s[i])),
-      k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
-    const drawn = {};
-    drawSource(drawn, "steps", sawtooth, ["p", "sp"]);
-    drawSource(drawn, "updates", rows, ["x"]);
+      k0: updates.k0, k1: updates.k1 };
+    drawSource("steps", sawtooth, ["p", "sp"]);
+    drawSource("updates", rows, ["x"]);
     if (isVisible("position")) {
-      drawSource(drawn, "measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
+      drawSource("measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
     }
     const expected = reference(axis, steps.time);
     if (isVisible("error") && expected !== null) {
       const e = steps.p.map((p, i) => p - expected[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
-      drawSource(drawn, "error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
+      drawSource("error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
     }
-    return drawn;
+    if (isVisible("innovation")) drawOutsideArrows();
   }
-  /* Position of ground truth at the given times; without ground truth of EKF2, without both null */
+  /* Position of ground truth at these times; without ground truth that of EKF2; null without both */
   function reference(axis, times) {
     if (!isText(axis.truth)) return Engine.interp(times, ...axis.truth.p, NaN);
     return isText(axis.ekf2) ? null : Engine.interp(times, ...axis.ekf2.state.slice(0, 2), NaN);
   }
-  function running(nu, s) {
-    const over = ranges.running, out = new Float64Array(nu.length).fill(NaN);
-    for (let i = 0, sum = 0; i < nu.length; i++) {
-      sum += nu[i] * nu[i] / s[i];
-      if (i >= over) sum -= nu[i - over] * nu[i - over] / s[i - over];
-      if (i >= over - 1) out[i] = Math.sqrt(sum / over);
-    }
-    return out;
-  }
   /* Draw EKF2 and ground truth, which depend only on axis and zoom */
   function drawReferences(axis) {
-    const drawn = {}, take = (...source) => drawSource(drawn, ...source);
     if (!isText(axis.ekf2)) {
       const { state, variance, innovations } = axis.ekf2;
-      take("state", table(["t", "p", "v"], state), ["p", "v"]);
-      take("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
+      drawSource("state", table(["t", "p", "v"], state), ["p", "v"]);
+      drawSource("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
       const rows = table(["t", "nu", "sigma", "rejected"], innovations), { t } = rows;
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
-        take(name, { t: Float64Array.from(which, (i) => t[i]),
+        drawSource(name, { t: Float64Array.from(which, (i) => t[i]),
           x: Float64Array.from(which, (i) => rows.nu[i] / rows.sigma[i]) }, ["x"]);
       }
-      take("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
     }
     if (!isText(axis.truth)) {
       const { p, v } = axis.truth;
-      take("truth_p", { t: p[0], p: p[1] }, ["p"]);
-      if (v !== null) take("truth_v", { t: v[0], v: v[1] }, ["v"]);
+      drawSource("truth_p", { t: p[0], p: p[1] }, ["p"]);
+      if (v !== null) drawSource("truth_v", { t: v[0], v: v[1] }, ["v"]);
       if (!isText(axis.ekf2)) {
         const [t, position] = axis.ekf2.state, expected = Engine.interp(t, ...p, NaN);
-        take("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
+        drawSource("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
       }
     }
-    return drawn;
   }
-  /* Draw KF and set the vertical ranges of the plots to the drawn values */
-  function drawPlots() {
-    const drawn = { ...drawnReferences, ...drawKf(result) }, { steps, updates } = drawn;
-    const of = (source, column) => drawn[source]?.[column] ?? EMPTY;
-    setRange("position", () => extent(steps.p, of("state", "p"), of("truth_p", "p")));
-    setRange("velocity", () => extent(steps.v, of("state", "v"), of("truth_v", "v")));
-    setRange("error", () => extent(of("error", "e"), of("error_ekf2", "e")));
-    setRange("sigma_p", () => extent(steps.sp, of("variance", "sp")), true);
-    setRange("sigma_v", () => extent(steps.sv, of("variance", "sv")), true);
-    setRange("running", () => extent(updates.running, of("running", "running"), ranges.bands.source), true);
-    setRange("gain", () => extent(updates.k0, updates.k1, [0]));
-    drawOutsideArrows(drawn);
-  }
-
   /* Add RMSE and the percentage of large innovations to the titles of the plots */
-  function drawTitles({ axis, run, numbers: kf }) {
+  function drawTitles({ axis, numbers: kf }) {
     const title = (name, text) => {
-      const span = query(`[data-plot=${name}] figcaption span`);
-      if (span !== null) span.textContent = text && `· ${text}`;
+      const span = $(name)?.parentElement.querySelector("figcaption span");
+      if (span) span.textContent = text && `· ${text}`;
     };
     const both = (format) => [["KF", kf], ["EKF2", ekf2Of(axis)]].flatMap(([name, values]) => {
       const text = values && format(values);
       return text ? [`${name} ${text}`] : [];
     }).join(", ");
     title("innovation", `values outside ±2 (expected 5 %): ${both(({ outside }) => outside === undefined ? "" : `${(100 * outside).toFixed(0)} %`)}`);
-    title("running", `RMS over ${ranges.running} measurements; green: consistent`);
     title("gain", "solid: position gain, dotted: velocity gain (1/s)");
-    if (run === null) return;
-    const sigmas = Array.from(run.steps.p00, Math.sqrt).sort((a, b) => a - b);
-    const quantile = (share) => sigmas[Math.floor(share * (sigmas.length - 1))], [low, middle, high] = [0.02, 0.5, 1].map(quantile);
-    const sigma = high < 1.5 * low ? Card.formatMetres(middle) : `${Card.formatMetres(low).slice(0, -2)} to ${Card.formatMetres(high)}`;
+    if (kf === null) return;
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
-    const shaded = `shaded: ±2σ reported by KF (σ ${sigma})${gaps}`;
+    const shaded = `shaded: ±2σ reported by KF${gaps}`;
     if (!isText(axis.truth)) {
       title("error", `RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${shaded}`);
     } else if (kf.ekf2P) {
-      query("[data-plot=error] b").textContent = "KF − EKF2 position difference (m)";
+      $("error").parentElement.querySelector("b").textContent = "KF − EKF2 position difference (m)";
       title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${shaded}`);
     }
   }
 
   // ------------------------------------------------------------------ likelihood map
-  const trail = { x: [], y: [] };
   let mapShown = null;
   function drawMap() {
     const map = mapNow(), plot = model("map");
     $("map").hidden = isText(map);
     if (isText(map)) return;
-    const last = trail.x.length - 1;
-    if (trail.x[last] !== settings.sigmaA || trail.y[last] !== settings.sigmaZ) {
-      trail.x.push(settings.sigmaA);
-      trail.y.push(settings.sigmaZ);
-      if (trail.x.length > 200) { trail.x.shift(); trail.y.shift(); }
-    }
-    const [[a0, a1], [z0, z1]] = [map.sigmaA, map.sigmaZ], name = axisNow().map;
+    const name = axisNow().map;
     if (mapShown !== name) {
       mapShown = name;
       for (const item of plot.renderers) {
@@ -577,10 +408,7 @@ const Explore = (async () => {
       const [a, z] = map.likely;
       setSource("best", map.likely.includes(null) ? { x: [], y: [] } : { x: [a], y: [z] });
     }
-    setSource("trail", { x: [...trail.x], y: [...trail.y] });
     setSource("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
-    [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
-    [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
   }
   function mapNote() {
     const map = mapNow(), initial = flight.settings;
@@ -595,32 +423,18 @@ const Explore = (async () => {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
     const words = [settings.offset !== flight.settings.offset ? fixed : base];
     for (const setting of SETTINGS) {
-      const standard = setting.key === "offset" ? 0 : lesson[setting.key];
-      if (setting.key === "offset" && fixedReason) continue;
+      const standard = setting.key !== "offset" ? lesson[setting.key] : fixedReason ? settings.offset : 0;
       if (settings[setting.key] !== standard) words.push(`--${setting.id} ${round(settings[setting.key], 12)}`);
     }
     if (settings.input !== defaultInput || input !== null) words.push(`--input ${settings.input}`);
     return words.join(" ");
   }
-  for (const button of queryAll("[data-copy]")) {
-    button.addEventListener("click", async () => {
-      button.textContent = await copyText($(button.dataset.copy)) ? "Copied" : "Press Ctrl+C";
-    });
-  }
-  async function copyText(node) {
-    try {
-      await navigator.clipboard.writeText(node.textContent);
-      return true;
-    } catch { // browsers forbid clipboard access for local files
-      getSelection().selectAllChildren(node);
-      return document.execCommand("copy");
-    }
-  }
-
   // ------------------------------------------------------------------ whole page
-  let axisShown = null, drawnReferences = null; // null: to be drawn
+  let axisShown = null; // null: to be drawn
   /* Run KF and draw the visible views; `quick`, during a drag of a slider: without texts and tables */
   function show(quick = false) {
+    cancelAnimationFrame(nextFrame);
+    nextFrame = null;
     pointLimit = quick ? MAX_DRAG_POINTS : MAX_POINTS;
     for (const setting of SETTINGS) {
       if (document.activeElement !== setting.number || !quick) setting.number.value = settings[setting.key];
@@ -631,16 +445,15 @@ const Explore = (async () => {
     axisShown = settings.axis;
     replay();
     if (isNewAxis) {
-      drawnReferences = drawReferences(result.axis);
+      drawReferences(result.axis);
       card.showAxis(settings.axis, flight.main);
       SETTINGS.forEach(markLikely);
     }
-    if (result.run) drawPlots();
+    if (result.run) drawKf(result);
     drawCard(result);
     drawTitles(result);
     if (isVisible("map")) drawMap();
     if (quick) return;
-    clearTimeout(finalDraw);
     for (const name of ["axis", "input"]) {
       for (const radio of queryAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
@@ -653,35 +466,29 @@ const Explore = (async () => {
     drawTable(result);
     $("command").textContent = command();
     if (isNewAxis) times.drawEvents(axis);
-    times.drawTrack();
     stepper.draw();
     toAddress();
   }
   /* Draw the same KF run again after a zoom */
   function redraw() {
-    drawnReferences = drawReferences(result.axis);
-    if (result.run) drawPlots();
-    times.drawTrack();
+    drawReferences(result.axis);
+    if (result.run) drawKf(result);
   }
 
   const stepper = Step.start({ settings, selected, result, model, setSource, figures, isVisible,
     moved: (time) => { times.showTime(time); toAddress(); } });
-  const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); },
-    s: stepper.slower, f: stepper.faster };
-  const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys });
+  const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); } };
+  const times = Times.start({ flight, model, setSource, timeRange, figures, redraw, keys });
   const { flown, command: example, why: noReplay } = flight.ekf2;
   for (const [name, value] of Object.entries(flown)) $("flown").append(make("dt", name), make("dd", value));
   if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));
   $("whatif-command").textContent = example ?? "";
   if (noReplay) $("whatif").replaceChildren(make("p", `EKF2 cannot be replayed: ${noReplay}.`, "note"));
-  drawTabs();
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();
   show();
-  const shared = { setSpan: times.setSpan, settings, set, open, result, flight, model,
-    numbers, timeRange, selected, stepper, axisNow, mapNow, ekf2Of, view: () => view };
-  Tour.start(shared);
+  const shared = { setSpan: times.setSpan, settings, set, open, result, flight, model, stepper };
   Practice.start(shared);
   return shared;
 })();

@@ -12,8 +12,9 @@ from px4fuse.explore.packing import Packer
 from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 
-MAX_LOG_TEXT_LENGTH = 2000  # maximum length of a text from a log; longer ones are shortened
-SCRIPT_NAMES = ("card", "step", "times", "tour")
+# Maximum length (characters) of a text from a log; longer texts are shortened
+MAX_LOG_TEXT_LENGTH = 2000
+SCRIPT_NAMES = ("card", "step", "times")
 PACKAGE = "px4fuse.explore"
 
 
@@ -125,9 +126,6 @@ def page_text(
         data=data_elements,
         flight_count=flight_count,
         choices=choices,
-        panels=[
-            (name, title)
-            for name, title in FIGURES.panels.items()
-            if name != "error" or has_reference(data)
-        ],
+        views=FIGURES.views,
+        has_reference=has_reference(data),
     )

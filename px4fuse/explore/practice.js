@@ -27,7 +27,6 @@ const Practice = (() => {
     $("quiz-title").textContent = `Flight ${current + 1} of ${count}: find the fault`;
     // commands need a log file, which a simulated flight does not have
     for (const id of ["as-report", "whatif", "task"]) $(id).hidden = true;
-    for (const button of queryAll(".tour-start")) button.hidden = true;
     const boxes = queryAll("[name=choice]"), fields = [$("quiz-size"), $("quiz-time")];
     const [, ...typed] = answers[current].split("|");
     fields.forEach((field, i) => { field.value = typed[i] ?? ""; });
@@ -65,7 +64,7 @@ const Practice = (() => {
     }
     $("quiz-score").textContent = done === 0 ? "" : `Score: ${sum} of ${done} answered flights${done === count ? ", all answered" : ""}`;
   }
-  /* Show the answer beside the solution, the re-run, and the card of the flight */
+  /* Show the answer beside the solution, and the card of the flight */
   function showSolution(page, solution, boxes) {
     const score = points(answers[current], solution), box = $("quiz-solution");
     const [, size, time] = answers[current].split("|");
@@ -80,7 +79,7 @@ const Practice = (() => {
       body.insertRow().append(make("th", name, { scope: "row" }), make("td", yours || "–", { dir: "auto" }),
         make("td", correct(name) || fallback));
     }
-    box.replaceChildren(heading, table, make("p", solution.rerun));
+    box.replaceChildren(heading, table);
     for (const { symptom, view, span } of solution.mistakes) {
       const button = make("button", "Show in the plots");
       button.addEventListener("click", () => {

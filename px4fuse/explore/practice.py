@@ -1,4 +1,4 @@
-"""Practice page: simulated flights with mistakes that the student has to identify.
+"""Practice page: simulated flights with injected faults that the student has to identify.
 
 The page contains the right answers, compressed so that students do not read them by accident.
 """
@@ -16,7 +16,6 @@ from msgspec import structs
 
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.core.record import Record, table
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
@@ -29,8 +28,8 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Pairs of right answers that one flight can combine: the first mistake affects the whole flight,
-# the second single samples. A wrong noise would hide another mistake, so it is not combined
+# Pairs of right answers that one flight can combine: the first injected fault affects the whole
+# flight, the second single samples. A wrong noise would hide another fault, so it is not combined
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
@@ -48,19 +47,19 @@ SCENARIO_VALUES: dict[str, Any] = {
 }
 # Smallest and largest length (m) of a pass along the aisle, which is drawn for each flight
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
-# Finding of the analysis that contains the time span of each mistake
+# Finding of the analysis that contains the time span of each injected fault
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
-# Name of the mistake "SIGMA_Z of KF is too small", which is a wrong setting and no fault in the log
+# Name of the injected fault "SIGMA_Z of KF is too small", which is a wrong setting and no fault in
+# the log
 NOISY_UWB = "noisy-uwb"
 
 
 class HiddenMistake(Record, frozen=True):
-    """Mistake in a practice flight that the student has to identify.
+    """Injected fault in a practice flight that the student has to identify.
 
     Attributes
     ----------
@@ -71,13 +70,13 @@ class HiddenMistake(Record, frozen=True):
     sizes : tuple of str
         Size for each level of difficulty, as after ``px4fuse simulate --mistake NAME=``.
     view : str
-        View of the page that shows the mistake.
+        View of the page that shows the injected fault.
     fault : str
-        Description of the mistake for the student.
+        Description of the injected fault for the student.
     size_text : str
         Text of the size; {0} and {1} are replaced by the numbers in ``sizes``.
     symptom : str
-        Effect on the plots, and the setting that confirms the mistake.
+        Effect on the plots, and the setting that confirms the injected fault.
     has_either_sign : bool
         True if the sign of the size is drawn at random.
     """
@@ -85,15 +84,15 @@ class HiddenMistake(Record, frozen=True):
     choice: str
     mistake: str
     sizes: tuple[str, str, str]
-    view: str
     fault: str
-    size_text: str
     symptom: str
+    size_text: str = "{0}"
+    view: str = "errors"
     has_either_sign: bool = False
 
 
 class MistakeTable(Record, frozen=True):
-    """Possible answers with their texts, and mistakes of practice flights (``practice.toml``)."""
+    """Possible answers with their texts, and faults of practice flights (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
@@ -112,9 +111,9 @@ class PracticeFlight:
     scenario : Scenario
         Settings of the simulation.
     mistakes : tuple of HiddenMistake
-        No, one or two mistakes with different right answers.
+        No, one or two injected faults with different right answers.
     sizes : tuple of str
-        Sizes of the mistakes, as after ``px4fuse simulate --mistake NAME=``.
+        Sizes of the injected faults, as after ``px4fuse simulate --mistake NAME=``.
     """
 
     scenario: Scenario
@@ -123,7 +122,7 @@ class PracticeFlight:
 
     @property
     def correct_answers(self) -> list[str]:
-        """Right answers about the mistakes of the flight, sorted."""
+        """Right answers about the injected faults of the flight, sorted."""
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
@@ -135,7 +134,8 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ..
     seed : int
         Random seed; the same seed, level and count give the same flights.
     level : {1, 2, 3}
-        Level of difficulty: a large mistake (1), a smaller one (2), or up to two small ones (3).
+        Level of difficulty: a large injected fault (1), a smaller one (2), or up to two small ones
+        (3).
     count : int
         Number of flights.
     """
@@ -208,14 +208,13 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     simulation = flights.simulate(practice_flight.scenario, parse(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # a corrected frame would hide the mistake
+    # a corrected frame would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
     descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
     key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
-        "rerun": _rerun_sentence(card) if descriptions else NO_MISTAKE,
         "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
@@ -226,7 +225,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Describe a mistake for the page: fault, size, time, symptom, and the view that shows it."""
+    """Describe an injected fault: size, time, symptom, and the view of the page that shows it."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
@@ -241,7 +240,7 @@ def _describe_mistake(
 
 
 def size_in_words(size: str) -> list[str]:
-    """Split the size of a mistake at commas, and add a blank before each unit.
+    """Split the size of an injected fault at commas, and add a blank before each unit.
 
     >>> size_in_words("5%,2m"), size_in_words("-400ms"), size_in_words("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
@@ -249,25 +248,8 @@ def size_in_words(size: str) -> list[str]:
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
 
 
-def _rerun_sentence(card: Card) -> str:
-    """Describe the most effective re-run with one change: RMSE and innovation before and after."""
-    reruns = (rerun for cause in card.causes for rerun in cause.reruns)
-    best_rerun = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
-    if best_rerun is None:
-        return "No re-run with one change corrects this flight."
-    changes = [
-        f"{name} {format_value(values[0])} → {format_value(values[1])}{unit}"
-        for name, values, format_value, unit in (
-            ("position RMSE", best_rerun.position_rmse_m, format_metres, " m"),
-            ("innovation ÷ √S", best_rerun.source_ratio, format_ratio, ""),
-        )
-        if values is not None
-    ]
-    return f"Re-run of {best_rerun.label}: {', '.join(changes)}."
-
-
 def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
-    """Replace the headline of the diagnosis if the analysis did not detect the mistake."""
+    """Replace the headline of the diagnosis if the analysis did not detect the injected fault."""
     if card.causes or not descriptions:
         return card
     fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)

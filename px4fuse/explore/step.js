@@ -3,8 +3,7 @@
 const Step = (() => {
   const CORNERS = 120;
   const TRAIL = 60; // number of previous KF steps whose positions and velocities are drawn
-  // duration of a prediction or update in the animation, from slow to fast
-  const STEP_TIMES_MS = [1600, 800, 400, 200, 100, 50];
+  const STEP_TIME_MS = 400; // duration of a prediction or update in the animation
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
@@ -78,7 +77,7 @@ const Step = (() => {
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null, speed = 2; // indices of a prediction or update in listNow(), and of STEP_TIMES_MS
+    let moment = null, playing = null; // index of a prediction or update in listNow(), and timer of the animation
 
     /* Show KF after the update with a measurement (index) */
     function goTo(measurement) {
@@ -109,17 +108,10 @@ const Step = (() => {
       const list = listNow();
       if (!list.length) return;
       if (moment === null || moment >= list.length - 1) moment = 0;
-      playing = setInterval(advance, STEP_TIMES_MS[speed]);
+      playing = setInterval(advance, STEP_TIME_MS);
       $("play").textContent = "Pause";
       $("now").ariaLive = "off"; // too fast for a screen reader
     }
-    function faster(by) {
-      speed = clamp(speed + by, 0, STEP_TIMES_MS.length - 1);
-      if (playing !== null) { pause(); play(); }
-      $("slower").disabled = speed === 0;
-      $("faster").disabled = speed === STEP_TIMES_MS.length - 1;
-    }
-
     function draw() {
       const { run } = result;
       if (isVisible("step")) selected.measurement ??= 0; // the view opens at the first update
@@ -173,22 +165,13 @@ const Step = (() => {
         line.location = z;
       }
       // the same scale for the whole run shows changes of the ellipse; only the first ellipses are larger
-      const reach = reachOf(run).map((typical, i) => Math.max(typical, 2.2 * Math.sqrt(now[2 + 2 * i])));
+      const reach = [run.updates.p00, run.updates.p11].map((variances, i) => Math.sqrt(Math.max(
+        8 * variances.toSorted()[Math.floor(0.9 * variances.length)], 5 * now[2 + 2 * i])));
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }
-    let cachedReach = { run: null, reach: [1, 1] };
-    function reachOf(run) {
-      if (cachedReach.run === run) return cachedReach.reach;
-      const typical = (values) => Float64Array.from(values, Math.sqrt).sort()[Math.floor(0.9 * values.length)];
-      const wide = Math.max(2.5 * typical(run.updates.p00), 2.5 * Math.min(settings.sigmaZ, 20 * typical(run.updates.p00)));
-      cachedReach = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
-      return cachedReach.reach;
-    }
-
     const actions = { first: () => goTo(0), previous: () => goTo((selected.measurement ?? 1) - 1),
-      next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play,
-      slower: () => faster(-1), faster: () => faster(1) };
+      next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play };
     for (const [id, act] of Object.entries(actions)) onClick(id, act);
     $("cursor").addEventListener("input", (event) => goTo(Number(event.target.value)));
     const restart = () => { // a new KF run has other steps but the same measurements

@@ -1,10 +1,10 @@
-/* Time range of the plots, events and map. */
+/* Time range and colours of the plots, and events. */
 const Times = (() => {
-  // CSS colours (--kf and so on) of the drawn elements with these names
-  const NAMES = ["kf", "ekf2", "truth", "measured", "paper", "ink", "muted", "line", "band"];
+  // Names of drawn elements; the colour of an element is the CSS variable with its name, such as --kf
+  const NAMES = ["kf", "ekf2", "truth", "measured", "ink", "band"];
 
   function start(page) {
-    const { flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys: otherKeys } = page;
+    const { flight, model, setSource, timeRange, figures, redraw, keys: otherKeys } = page;
     const ends = flight.shown;
 
     // ------------------------------------------------------------------ visible time range
@@ -41,7 +41,9 @@ const Times = (() => {
       "-": actions.wider, 0: actions.whole, ...otherKeys };
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.target.matches("input, [role=tab], summary") || (event.key === " " && event.target.matches("button"))) return;
+      const isRadioKey = event.key === " " || event.key.startsWith("Arrow");
+      if (event.target.matches("input:not([type=radio]), summary") || (event.key === " " && event.target.matches("button"))
+        || (isRadioKey && event.target.matches("[type=radio]"))) return;
       if (keys[event.key]) { keys[event.key](); event.preventDefault(); }
     });
 
@@ -65,34 +67,11 @@ const Times = (() => {
       setSource("strip", rows);
     }
 
-    // ------------------------------------------------------------------ map
-    function drawTrack() {
-      if (isText(flight.plan) || !isVisible("plan")) return;
-      const [time, north, east] = flight.plan, t = shifted(time, settings.offset - flight.settings.offset);
-      const inside = [...t.keys()].filter((i) => t[i] >= timeRange.start && t[i] <= timeRange.end);
-      const track = model("plan-source");
-      if (!track.data.t.length) {
-        setSource("plan", { t: time, north, east });
-        track.selected.properties.indices.change.connect(() => {
-          const { indices } = track.selected;
-          if (!indices.length) return;
-          const [low, high] = [Math.min(...indices), Math.max(...indices)];
-          track.selected.indices = [];
-          setSpan(time[low], time[high]);
-        });
-      }
-      setSource("shown", { north: inside.map((i) => north[i]), east: inside.map((i) => east[i]) });
-    }
-
-    /* Mark the position at time t (s) on the map, and make t visible in the plots */
+    /* Make time t (s) visible in the plots */
     function showTime(t) {
-      if (t < timeRange.start || t > timeRange.end) {
-        const half = (timeRange.end - timeRange.start) / 2;
-        setSpan(t - half, t + half);
-      }
-      if (isText(flight.plan) || !isVisible("plan")) return;
-      const [time, north, east] = flight.plan, times = [t - settings.offset + flight.settings.offset];
-      setSource("here", { north: Engine.interp(times, time, north), east: Engine.interp(times, time, east) });
+      if (t >= timeRange.start && t <= timeRange.end) return;
+      const half = (timeRange.end - timeRange.start) / 2;
+      setSpan(t - half, t + half);
     }
 
     // ------------------------------------------------------------------ colours
@@ -100,16 +79,9 @@ const Times = (() => {
     function paint() {
       const style = getComputedStyle(document.documentElement);
       const colours = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`)]));
-      for (const plot of [...figures, ...["map", "plan", "step"].map(model)]) {
-        plot.background_fill_color = plot.border_fill_color = colours.paper;
-        plot.outline_line_color = colours.line;
-        for (const axis of [...plot.left, ...plot.below]) {
-          axis.axis_label_text_color = axis.major_label_text_color = colours.muted;
-          axis.axis_line_color = axis.major_tick_line_color = axis.minor_tick_line_color = colours.muted;
-        }
+      for (const plot of [...figures, ...["map", "step"].map(model)]) {
         for (const item of plot.center) {
-          if (item.type === "Grid") item.grid_line_color = colours.line;
-          else item.line_color = { cursor: colours.ink, measurement: colours.measured, consistent: colours.band }[item.name] ?? null;
+          if (item.type !== "Grid") item.line_color = { cursor: colours.ink, measurement: colours.measured, consistent: colours.band }[item.name] ?? null;
           if (item.name === "band") item.fill_color = colours.measured;
           if (item.name === "consistent") item.fill_color = colours.band;
         }
@@ -130,7 +102,7 @@ const Times = (() => {
       for (const plot of figures) plot.toolbar.active_drag = null;
     }
     showRange();
-    return { drawEvents, drawTrack, showTime, setSpan };
+    return { drawEvents, showTime, setSpan };
   }
 
   return { start };

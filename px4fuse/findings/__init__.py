@@ -7,7 +7,7 @@ To add a finding: write a module with ``detect`` and add it to :data:`DETECTORS`
 and meaning to ``catalogue.toml``, and the rates to ``tests/studies/rates.csv``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import AidResult
@@ -34,7 +34,7 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, Findings, group_by_root
+from px4fuse.findings.model import TITLES, group_by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [
@@ -48,33 +48,33 @@ __all__ = [
     "group_by_root",
 ]
 
-# Functions that yield the findings of a flight; group_by_cause orders the findings
-DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
-    aids.detect,
-    ekf2_noise.detect,
-    ekf2_not_fusing.detect,
-    ekf2_rejecting.detect,
-    ekf2_resets.detect,
-    hidden_errors.detect,
-    imu.detect,
-    loops.detect,
-    missing.detect,
-    noises.detect,
-    recording.detect,
-    source_clock.detect,
-    source_convention.detect,
-    source_frame.detect,
-    source_intervals.detect,
-    source_noise.detect,
-    source_positions.detect,
-    source_stamps.detect,
-    source_values.detect,
+# Modules of the detectors; group_by_cause orders their findings
+DETECTORS = (
+    aids,
+    ekf2_noise,
+    ekf2_not_fusing,
+    ekf2_rejecting,
+    ekf2_resets,
+    hidden_errors,
+    imu,
+    loops,
+    missing,
+    noises,
+    recording,
+    source_clock,
+    source_convention,
+    source_frame,
+    source_intervals,
+    source_noise,
+    source_positions,
+    source_stamps,
+    source_values,
 )
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
     """Return the findings, most severe first, each cause followed by its consequences."""
-    findings = [found for detect in DETECTORS for found in detect(analysis)]
+    findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 

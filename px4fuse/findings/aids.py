@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import capitalise_first, format_number, format_ratio
@@ -18,16 +19,17 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which EKF2 does not fuse the barometer: the ground changes the pressure
+# Time (s) after take-off in which a barometer that is not fused is no fault: the ground changes the
+# pressure
 TAKE_OFF_S = 10.0
-# Minimum ratio of EKF2's largest height error in a gap of the barometer to the height RMSE outside
-# the gap, from which the gap is a warning instead of a note
+# Minimum ratio of EKF2's largest height error in a gap of the barometer to its height RMSE outside
+# the gap, for severity warning
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with the flag for a bad vertical acceleration, for a note
+# Maximum fraction of the time with the flag for a bad vertical acceleration, for severity note
 MAX_SHORT_BAD_ACCELERATION = 0.3
-# Check of a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
+# Action for a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -91,7 +93,7 @@ def detect_in_aids(
     take_off_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
-    """Yield at most one finding per aiding source; unfused ones of one sensor share a finding.
+    """Detect faults of EKF2's aiding sources, at most one for each of them.
 
     Parameters
     ----------
@@ -191,16 +193,12 @@ def detect_in_aids(
 
 
 def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
-    """Return EKF2's largest height error (m) in a span; None if unknown or not unusually large."""
+    """Return EKF2's largest height error (m) in a time span, if it is unusually large."""
     down = analysis.axes.get("down")
-    if (
-        down is None
-        or isinstance(down.ekf2_state, Unavailable)
-        or isinstance(down.truth, Unavailable)
-    ):
+    errors = None if down is None else position_errors(down, "ekf2")
+    if errors is None or isinstance(errors, Unavailable):
         return None
-    height_m, true = down.ekf2_state["position_m"], down.truth["position_m"]
-    error_m = np.abs(height_m - np.interp(height_m.index, true.index, true, np.nan, np.nan))
+    error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_m = float(error_m[is_in_span].max())  # NaN if no error is known
@@ -212,7 +210,7 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source_aid: str) -> str:
-    """Return SENSOR if an aid and KF's position source use one sensor (one parameter), else ""."""
+    """Return SENSOR if an aiding source and KF's positions come from the same sensor."""
     return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
 
 

@@ -8,7 +8,7 @@ from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import TITLES, group_by_root
 
-# Key in Finding.evidence for the kind of cause, which re-runs with changed settings or data show
+# Key in Finding.evidence of the kind of cause, which re-runs with a change have shown
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,18 +20,17 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Evidence key of time-correlated noise: ratio of its white part to the measurement σ that a filter
-# assumes. Present only if the ratio is large: the assumed σ is then a separate fault
+# Key in Finding.evidence: white noise of the source over the measurement σ of a filter. It is
+# present only if the ratio is large; then the assumed σ is a separate fault
 WHITE_RATIO = "white_over_assumed"
 # Values of CAUSE in a finding about an aiding source: this and the position source are the same
 # sensor, or the mean innovation of the aiding source changes in flight
 SENSOR, CHANGE = "the source's sensor", "change"
-# Kind of cause of ekf2_resets: all position resets follow a gap in the position source
+# Kind of cause of ekf2_resets: each position reset follows a gap in the position source
 GAP = "gap"
-# Evidence key of faults of the source's convention, which precede all others
+# Key in Finding.evidence of findings about the convention of the source, which precede all others
 CONVENTION = "convention"
-# Faults of the source that leave no usable position, and others that make findings about EKF2's
-# parameters false; they precede all others
+# Findings that precede all others, because no estimate from these positions is valid
 UNUSABLE = (
     "source_is_ekf2_estimate",
     "source_two_senders",
@@ -39,7 +38,7 @@ UNUSABLE = (
     "source_lever_arm",
     "source_timestamps_shared",
 )
-# Evidence key of a jump that the source announced: it set a new origin
+# Key in Finding.evidence of the time (s) at which the source announced a jump by its reset_counter
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
@@ -59,7 +58,7 @@ NOISES = frozenset(
         "process_noise_near_zero",
     )
 )
-# Consequences of each cause, in the order in which they are attached: "id", or "id: kind of cause"
+# Findings that a cause explains, one per line: "id", or "id: kind of cause"
 CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
 RECORDING = frozenset(
     {
@@ -70,7 +69,6 @@ RECORDING = frozenset(
         "log_damaged",
         "logger_dropouts",
         "imu_rate_too_low",
-        "source_rate_limited_by_logger",
         "source_begins",
         "source_gap",
         "source_gap_in_log",
@@ -83,7 +81,7 @@ RECORDING = frozenset(
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings in the order of correction, each cause followed by the findings it explains.
+    """Sort findings in the order of correction: each cause is followed by its effects.
 
     Findings are sorted by severity, then in the order of :data:`TITLES`. A cause is at least as
     severe as the findings that it explains.

@@ -3,11 +3,18 @@
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import changes
-from px4fuse.comparison.causal_replays import Intervention
+from px4fuse.comparison import changes, trials
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import aid_of, format_settings
-from px4fuse.comparison.trials import can_improve, improvement
+from px4fuse.comparison.trials import (
+    Statistic,
+    Trial,
+    can_improve,
+    contradicts_truth,
+    explained_fraction,
+    improvement,
+    is_sufficient,
+)
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_UNITS
 from px4fuse.findings import cause_grouping as kinds
@@ -17,17 +24,17 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
-def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
-    """Return the kind of cause by the change that a re-run tested; a sensor fault comes first."""
+def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
+    """Return the kind of cause by the changed quantity of a re-run."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
     kind_by_change = {
-        changes.OUTLIERS: kinds.OUTLIERS,
-        changes.CLOCK_OFFSET: kinds.CLOCK,
+        trials.OUTLIERS: kinds.OUTLIERS,
+        trials.CLOCK_OFFSET: kinds.CLOCK,
         aid.delay: kinds.CLOCK,
-        changes.ROTATION: kinds.FRAME,
-        changes.FORWARD_BIAS: kinds.ACCELEROMETER,
+        trials.ROTATION: kinds.FRAME,
+        trials.FORWARD_BIAS: kinds.ACCELEROMETER,
         changes.SIGMA_Z: kinds.NOISE,
         aid.noise: kinds.NOISE,
         aid.gate: kinds.GATE,
@@ -37,54 +44,55 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
     )
 
 
-def is_refuted(analysis: Analysis, owner: FilterName, cause: Intervention) -> bool:
-    """Return True if this change, re-run along the main axis, improves neither position nor σ."""
+def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
+    """Return True if a re-run along the main axis shows that the change improves nothing."""
     return any(
         (trial.filter, trial.change) == (owner, cause.change)
         and can_improve(trial)
         and improvement(trial) == "nothing"
-        for trial in analysis.trials
+        for trial in analysis.main_trials
     )
 
 
-def format_change(analysis: Analysis, cause: Intervention) -> str:
+def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run, for example "SIGMA_Z 0.1 m instead of 0.05 m"."""
     return " and ".join(
         _format_one_change(analysis, cause, name)
         for name in cause.change
-        if name not in changes.ACCOMPANYING_CHANGES
+        if name not in trials.ACCOMPANYING_CHANGES
     )
 
 
-def format_explained_share(cause: Intervention) -> str:
-    """Format the fraction of a deviation that disappears in a re-run with a change."""
-    if cause.contradicts_truth:
+def format_explained_share(cause: Trial, statistic: Statistic) -> str:
+    """Format the fraction of ln(mean NIS or NEES) that a change explains."""
+    if contradicts_truth(cause, statistic):
         return "contradicts ground truth"
-    if cause.is_sufficient:
+    if statistic != "difference" and is_sufficient(cause, statistic):
         return "all"
-    if cause.explained_fraction > 1.0 and cause.statistic != "difference":
+    fraction = explained_fraction(cause, statistic)
+    if fraction > 1.0:
         return "too much"
-    return format_percent(cause.explained_fraction) if cause.explained_fraction > 0.0 else "nothing"
+    return format_percent(fraction) if fraction > 0.0 else "nothing"
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Format the action for a change that a re-run confirms, one sentence per changed quantity."""
+    """Format the action for a change, with one sentence for each changed quantity."""
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
-    if change.pop(changes.OUTLIERS, None):
+    if change.pop(trials.OUTLIERS, None):
         place = "Give the antenna a free view of the sky" if is_gnss else "Restore line of sight"
         actions.append(f"{place}, or remove the outliers at the sender.")
-    if change.pop(changes.FORWARD_BIAS, None) is not None:
+    if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
-        change.pop(changes.RIGHT_BIAS)
-    if turn_deg := change.pop(changes.ROTATION, None):
+        change.pop(trials.RIGHT_BIAS)
+    if turn_deg := change.pop(trials.ROTATION, None):
         # GNSS positions refer to true north, so a rotation is an error of EKF2's heading
         actions.append(
             "Calibrate the magnetometer, away from metal."
             if is_gnss
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
-    if (offset_s := change.pop(changes.CLOCK_OFFSET, None)) is not None:
+    if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         verb = f"Subtract {-offset_s:.3f} s from" if offset_s < 0 else f"Add {offset_s:.3f} s to"
         actions.append(f"{verb} the timestamps at the sender.")
     settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
@@ -105,19 +113,19 @@ def format_kf_settings(settings: Mapping[str, float]) -> str:
     return f"Set {' and '.join(texts)}."
 
 
-def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> str:
+def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
     value, settings = cause.change[name], analysis.settings
     match name:
-        case changes.OUTLIERS:
+        case trials.OUTLIERS:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case changes.CLOCK_OFFSET:
+        case trials.CLOCK_OFFSET:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
-        case changes.FORWARD_BIAS:
-            right = cause.change[changes.RIGHT_BIAS]
+        case trials.FORWARD_BIAS:
+            right = cause.change[trials.RIGHT_BIAS]
             return f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} right)"
-        case changes.ROTATION:
+        case trials.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             mean = " on average" if is_drifting else ""
             return (

@@ -16,16 +16,17 @@ from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum ratio of flown and estimated noise (σ) for an error; below, EKF2's error hardly changes
+# Minimum ratio of flown and estimated noise (σ) for severity error: a smaller one hardly changes
+# EKF2's error
 MIN_RATIO_ERROR = 2.0
-# Minimum fraction of positions rejected by EKF2 for the title to contain it
+# Minimum fraction of rejected positions for the title to state it
 MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a measurement noise whose change makes EKF2's innovations consistent in a replay."""
+    """Detect an EKF2 measurement noise whose correction makes EKF2's innovations consistent."""
     aid = aid_of(analysis)
-    trial = find_trial(analysis.trials, "ekf2", "noise", aid.noise)
+    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid.noise)
     if trial is None or not _corrects_innovations(trial):
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)  # a re-run of EKF2 needs its model

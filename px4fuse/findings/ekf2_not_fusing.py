@@ -24,11 +24,18 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
 from px4fuse.flight.position_source import POSITION_FILE
 
-MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
-MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
-MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
+# Minimum fraction of the segment with fusion for a severity below error: with less, EKF2 uses other
+# sensors most of the time
+MIN_FUSING_SHARE_ERROR = 0.5
+# Minimum fraction of the segment with fusion for no finding: 2 % of a minute are about 1 s
+MIN_FUSING_SHARE_WARNING = 0.98
+# Minimum interval (s) of positions that may delay the start of fusion: with 10 % of jitter it
+# reaches EV_START_INTERVAL_S
+MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
+# Minimum distance (m) to the reference for a finding of an invalid position: it is smaller before
+# take-off
+MIN_INVALID_DISTANCE_M = 1.0
 
 
 def detect(analysis: Comparison) -> Findings:
@@ -39,7 +46,7 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def detect_missing_fusion(analysis: Comparison) -> Findings:
-    """Detect that EKF2 fused the source only in a small part of the segment."""
+    """Detect that EKF2 did not fuse the source, or only in a part of the segment."""
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
@@ -99,7 +106,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
 
 
 def _received_source(analysis: Comparison) -> PositionTrack | None:
-    """Return the source that EKF2 received; a position file is not one. None without a source."""
+    """Return the source that PX4 received; a position file did not reach PX4."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
@@ -107,7 +114,7 @@ def _received_source(analysis: Comparison) -> PositionTrack | None:
 
 
 def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
-    """Detect that EKF2 declares its position invalid; it is then not the result of fusion."""
+    """Detect that EKF2 declares its own horizontal position invalid."""
     is_valid = ekf2.states.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
@@ -134,9 +141,9 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return the largest horizontal distance (m) of EKF2 to the ground truth, or to the source.
+    """Return EKF2's largest horizontal distance (m) to ground truth, else to the source.
 
-    NaN if neither covers the spans.
+    NaN if neither has samples in the spans.
     """
     truth, axes = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
@@ -149,7 +156,7 @@ def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
-    """Detect that EKF2 resumed fusion late after a gap: positions come too slowly."""
+    """Detect that EKF2 resumed fusion late after a gap, because positions are too rare."""
     source = analysis.source
     is_limited = "EKF2_EV_CTRL" in analysis.flight.log.parameters  # v1.14 and later
     is_known = source.origin.is_vision and source.origin.has_all_samples and not source.alignment

@@ -12,9 +12,13 @@ from px4fuse.findings.model import Findings, finding, format_percent, zero_lengt
 from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
-REJECTED_SHARE_ERROR = 0.20  # rejected fraction for an error: R or the time offset is wrong
-MAX_REJECTED_RATIO = 0.5  # rejected fraction with over without a change that prevents rejections
+# Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
+# rejects 6e-7
+REJECTED_SHARE_WARNING = 0.01
+# Minimum fraction of rejected samples for an error: R or the time offset is wrong
+REJECTED_SHARE_ERROR = 0.20
+# Maximum ratio of rejected fractions after and before a change that prevents rejections
+MAX_REJECTED_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -25,7 +29,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate that rejects 1 % of the samples even if their noise is as EKF2 assumes."""
+    """Detect a gate that would reject 1 % of the samples of a consistent filter."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
         # EKF2 accepts a sample if the normal innovations of both axes are inside: erf(gate/√2)²
@@ -68,9 +72,8 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 
 def _remedy(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the change whose re-run prevents most rejections; without one, a check."""
     aid = aid_of(analysis, result.axis.name)
-    trials = [trial for trial in analysis.trials if _prevents_rejections(trial)]
+    trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
     if trials and result is analysis.main:
         return format_action(analysis, min(trials, key=preference).change)
     place = "the reception" if aid == GNSS_POS else "the line of sight"

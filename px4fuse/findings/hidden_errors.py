@@ -9,27 +9,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    ErrorAboveSigma,
-    Intervention,
-    error_above_reported_sigma,
-    find_cause,
-)
+from px4fuse.comparison.causal_replays import ErrorAboveSigma, error_above_reported_sigma
+from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import (
     FILTERS,
-    AxisComparison,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
     north_and_east,
 )
-from px4fuse.core.arrays import Array
+from px4fuse.comparison.trials import Trial, find_cause
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
-from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
@@ -39,11 +32,12 @@ from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
-MIN_NEES_ERROR = 16.0  # mean NEES from which the finding is an error: position errors of 4 σ
-# Maximum position RMSE of KF over that of EKF2 if only EKF2 has a fault. Both filters use the same
-# source: it then causes at most 0.7² (49 %) of EKF2's mean square error
+# Minimum mean NEES for severity error: position errors of 4 σ
+MIN_NEES_ERROR = 16.0
+# Maximum ratio of the position RMSEs of KF and EKF2 for a fault of EKF2 alone: the common source
+# then causes at most half of EKF2's mean square error
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum position RMSE after alignment over RMSE before, for a misaligned frame as main cause
+# Maximum ratio of the position RMSE after and before alignment for a misaligned frame
 MAX_ALIGNED_SHARE = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -101,7 +95,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect hidden position errors; without any, a position source that may drift."""
+    """Detect position errors that innovations do not show, else a source that may drift."""
     if hidden := find_hidden_errors(analysis):
         yield make_error_finding(analysis, hidden)
     elif analysis.source.origin.may_drift:
@@ -111,12 +105,12 @@ def detect(analysis: Analysis) -> Findings:
 def make_error_finding(
     analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    """Make the finding of hidden errors, with numbers of the main axis if it has one."""
+    """Make the finding of position errors larger than the reported σ."""
     hidden = sorted(hidden, key=lambda entry: entry[1] != analysis.main.axis.name)
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratios, sentences = dict[str, float](), list[str]()
-    causes = dict[FilterName, Intervention]()
+    causes = dict[FilterName, Trial]()
     for filter_name in FILTERS:
         label = filter_name.upper()
         for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
@@ -126,7 +120,7 @@ def make_error_finding(
                 f"{filter_name}_position_rmse_m": excess.rmse_m,
                 f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
             }
-            cause = find_cause(analysis.causes, filter_name, axis, "nees")
+            cause = find_cause(analysis.trials, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
                 causes[filter_name] = cause
             ratios[label] = excess.nees**0.5
@@ -161,13 +155,8 @@ def make_error_finding(
         remedy = FRAME_REMEDY
     elif is_ekf2_alone:
         remedy = EKF2_REMEDY
-    sizes = " and ".join(f"{format_ratio(ratio)} ({label})" for label, ratio in ratios.items())
-    title = f"Position errors are {sizes} times σ, which innovations do not show"
-    if len(ratios) == 1:
-        ((label, ratio),) = ratios.items()
-        title = (
-            f"{label}: position error {format_ratio(ratio)} times σ, which innovations do not show"
-        )
+    sizes = (f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratios.items())
+    title = f"Position errors that innovations do not show: {', '.join(sizes)}"
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",
@@ -209,49 +198,38 @@ def _drift_finding(
 
 
 def _known_closure_error_m(loop: Loop) -> float | None:
-    """Return the closure error (m) of odometry; None if the true landing place is unknown."""
     if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
         return None
     return loop.closure_error_m
 
 
-def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
-    """Return the horizontal RMSE before and after alignment in yaw; None without truth."""
-    axes = north_and_east(comparison)
-    truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
-    if len(truths) < 2:
+def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
+    """Return the horizontal RMSE before and after a fit in position and yaw."""
+    error, true_track = [], []
+    for result in north_and_east(comparison):
+        errors, truth = position_errors(result, filter_name), result.truth
+        if isinstance(errors, Unavailable) or isinstance(truth, Unavailable):
+            return None
+        error.append(errors["error_m"])
+        true_track.append(np.interp(errors.index, truth.index, truth["position_m"]))
+    if len(error) < 2:
         return None
-    times = truths[0].index.to_numpy()
-    tracks = [
-        state_at(result.replay, times)[0]
-        if filter_name == "kf"
-        else _interpolate_ekf2_position(result, times)
-        for result in axes
-    ]
-    zero_height = np.zeros(len(times))
-    estimate = np.column_stack([*tracks, zero_height])
-    true_track = np.column_stack([*(truth["position_m"] for truth in truths), zero_height])
-    has_both = np.isfinite(estimate).all(axis=1) & np.isfinite(true_track).all(axis=1)
-    estimate, true_track = estimate[has_both], true_track[has_both]
+    zero_height, known = np.zeros(len(error[0])), np.isfinite(error).all(axis=0)
+    error_m, true_m = (
+        np.column_stack([*columns, zero_height])[known] for columns in (error, true_track)
+    )
     try:
-        aligned = fit_alignment(estimate, true_track, "yaw").apply(estimate)
+        aligned_m = fit_alignment(true_m + error_m, true_m, "yaw").apply(true_m + error_m)
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
-    errors = (estimate - true_track, aligned - true_track)
     rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(error)) / len(true_track) ** 0.5 for error in errors
+        float(np.linalg.norm(part)) / len(true_m) ** 0.5 for part in (error_m, aligned_m - true_m)
     )
     return AlignedError(rmse_m, aligned_rmse_m)
 
 
-def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
-    assert isinstance(result.ekf2_state, pd.DataFrame)  # EKF2's error was computed from this state
-    state = result.ekf2_state["position_m"]
-    return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
-
-
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    """Make the note on odometry, with its short-term noise and loop closure error."""
+    """Make the note that odometry may drift."""
     sensor, loop = source_name(analysis.source), analysis.loop
     tuned = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}

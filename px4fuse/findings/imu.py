@@ -13,15 +13,24 @@ from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
-BIAS_ERROR_M_S2 = 0.3  # m/s²; bias from which the finding is an error: 0.15 m after 1 s
-TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt error equivalent to a bias of 1 m/s²
-MIN_IMU_GAP_S = 0.2  # s; total length of reported gaps: two prediction steps of KF
-MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, with a margin against aliasing
-MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s
-MAX_CLIPPED_S = 0.1  # s; total clipping that is not reported: a touch-down clips one or two samples
-MIN_CLIPPING_PAUSE_S = 2.0  # s; time without clipping that separates two reported time spans
-HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4: full IMU rate (logged_topics.cpp)
-RATE_MARGIN = 0.98  # ratio; measured message rates are up to 2 % below the requested rate
+# Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
+BIAS_ERROR_M_S2 = 0.3
+# Tilt error (°) with the same effect as an accelerometer bias of 1 m/s²
+TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
+# Minimum time (s) without IMU samples for a finding: two prediction steps of KF
+MIN_IMU_GAP_S = 0.2
+# Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
+MIN_IMU_RATE_HZ = 50.0
+# Minimum attitude rate (Hz) for interpolation
+MIN_ATTITUDE_RATE_HZ = 10.0
+# Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
+MAX_CLIPPED_S = 0.1
+# Minimum time (s) without clipping between two reported time spans
+MIN_CLIPPING_PAUSE_S = 2.0
+# Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
+HIGH_RATE_BIT = 16
+# Minimum ratio of measured and requested rate: measured rates are up to 2 % lower
+RATE_MARGIN = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -35,7 +44,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bias(analysis: Analysis) -> Findings:
-    """Detect an accelerometer bias, estimated from the positions, else by EKF2."""
+    """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     fit, ekf2_bias = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
     if isinstance(fit, BiasScaleJumpFit) and fit.has_bias:
         forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
@@ -74,7 +83,7 @@ def detect_bias(analysis: Analysis) -> Findings:
 
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
-    """Return EKF2's median accelerometer bias forward, right and down (m/s²); None if unknown."""
+    """Return EKF2's median accelerometer bias forward, right and down (m/s²), if logged."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
@@ -119,7 +128,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    """Detect gaps of the IMU longer than two prediction steps of KF and two IMU intervals."""
+    """Detect gaps of the IMU that are longer than two prediction steps of KF."""
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
@@ -136,7 +145,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 
 
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
-    """Detect single IMU samples that the logger lost all over the flight."""
+    """Detect a log in which single IMU samples are missing all the time."""
     imu, log = analysis.flight.imu, analysis.flight.log
     if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
         return
@@ -187,12 +196,10 @@ def detect_low_rates(flight: Flight) -> Findings:
             profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
             action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
-                action = f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
-                if log.has_ulog:
-                    action = (
-                        f"Request {topic} at {requested_hz:g} Hz (PX4 console: mavlink stream -d "
-                        f"DEVICE -s {topic} -r {requested_hz:g}), or give the ULog of the flight."
-                    )
+                ulog = ", or give the ULog of the flight" if log.has_ulog else ""
+                action = (
+                    f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL){ulog}."
+                )
             yield warning(
                 "imu_rate_too_low",
                 f"The {label} was logged at {rate_hz:.1f} Hz, but {needed_hz:g} Hz are needed. "

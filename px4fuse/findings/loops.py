@@ -7,25 +7,27 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true, so more are drift
+# Maximum fraction of dropped closures: if more are dropped, the stated drift is too small
+MAX_DROPPED_SHARE = 0.5
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-MIN_KEPT_WEIGHT = 0.5  # weight of a used closure; GNC weights end at 0 or 1 (Yang et al. 2020)
+# Minimum weight of a closure that GNC uses; its final weights are near 0 or 1 (Yang et al. 2020)
+MIN_KEPT_WEIGHT = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect false closures and assumptions of the flight's loop, if it has a loop."""
+    """Detect faults of the loop of a flight, if the flight has a loop."""
     if isinstance(analysis.loop, Loop):
         yield from detect_in_loop(analysis.loop)
 
 
 def detect_in_loop(loop: Loop) -> Findings:
-    """Detect false closures and assumptions of a loop."""
+    """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
     yield from detect_assumptions(loop)
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
-    """Detect closures that drift does not explain, or that contradict other closures."""
+    """Detect loop closures that contradict the drift or other loop closures."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
     dropped_count = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
     drops_most = dropped_count > MAX_DROPPED_SHARE * len(weights)
@@ -51,7 +53,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
 
 
 def detect_assumptions(loop: Loop) -> Findings:
-    """Detect a loop on positions that do not drift, and a landing place that is assumed."""
+    """Detect a loop without drift, and a landing place that is assumed."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.is_absolute_track:

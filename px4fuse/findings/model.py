@@ -14,11 +14,11 @@ from px4fuse.finding import SEVERITIES, Finding, Severity
 
 
 class CatalogueEntry(Record, frozen=True):
-    """Title, group (one of :data:`GROUPS`) and explanation of a finding for new readers."""
+    """Title, group (one of :data:`GROUPS`) and meaning of a finding."""
 
     title: str
-    group: str
     meaning: str
+    group: str = "position source"
 
 
 # Catalogue of findings by id; findings of equal severity are listed in this order
@@ -27,11 +27,6 @@ CATALOGUE: Mapping[str, CatalogueEntry] = table(
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
-# Present finding id, by the id before schema 4 of the results
-RENAMED_IDS: Mapping[str, str] = dict(
-    line.split()
-    for line in table(__file__, "renamed_ids.toml", dict[str, str])["renamed_ids"].splitlines()
-)
 
 
 class Example(Record, frozen=True):
@@ -82,7 +77,7 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Group findings: each finding without a known cause, followed by its consequences."""
+    """Split findings into groups: a finding without a cause, followed by its effects."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:
@@ -92,22 +87,19 @@ def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
 
 
 def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
-    """Return spans of zero length at the given times (s)."""
     return tuple((float(time), float(time)) for time in times_s)
 
 
 def lower_severity(severity: Severity) -> Severity:
-    """Lower a severity by one level, because the user did not choose a default setting."""
+    """Lower a severity by one level."""
     return "warning" if severity == "error" else "note"
 
 
 def format_count(count: int) -> str:
-    """Format a number of occurrences: "once", "2 times"."""
     return "once" if count == 1 else f"{count} times"
 
 
 def format_percent(fraction: float, digits: int = 0) -> str:
-    """Format a fraction as a percentage: "57 %"."""
     return f"{100.0 * fraction:.{digits}f} %"
 
 

@@ -12,18 +12,20 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    Intervention,
-    find_cause,
-    interventions_for,
-    is_inconsistent,
-)
+from px4fuse.comparison.causal_replays import is_inconsistent
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
-from px4fuse.comparison.trials import can_improve, find_trial
+from px4fuse.comparison.trials import (
+    Trial,
+    can_improve,
+    contradicts_truth,
+    find_cause,
+    find_trial,
+    find_trials,
+)
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
@@ -37,25 +39,29 @@ from px4fuse.findings.cause_text import (
     is_refuted,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
+from px4fuse.findings.model import Findings, error, finding, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
-MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for severity "error"
-MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
-INTERVAL_WIDENING = (
-    1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
-)
-MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
+# Minimum ratio of a setting and its estimate (σ) for a warning: with less the track hardly changes
+MIN_NOISE_RATIO = 1.5
+# Minimum ratio of a setting and its estimate (σ) for severity error
+MIN_NOISE_RATIO_ERROR = 4.0
+# Minimum response time (s) of KF for Q almost zero: vehicles turn faster
+MIN_RESPONSE_TIME_S = 2.5
+# Factor on the 95 % interval (log scale) of a setting: 0.3 % of correct settings are outside
+INTERVAL_WIDENING = 1.5
+# Minimum lag-1 autocorrelation of the innovations for a lagging KF: white ones have less than 0.2
+MIN_LAG1_AUTOCORRELATION = 0.3
 
-MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for severity "error"
-# Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
+# Minimum ratio of actual and reported σ, or its inverse, for severity error
+MIN_SIGMA_RATIO_ERROR = 2.0
+# Maximum ratio of two estimates of the same noise: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# Actions if no re-run explains an inconsistent variance
+# Actions for an inconsistent filter whose cause no re-run shows
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
     "(rate, gaps, vibration)."
@@ -157,7 +163,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
 def _setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
 ) -> Finding:
-    """Make the finding of a wrong setting; a note if a re-run with the estimate is no better."""
+    """Make the finding of a wrong noise setting of KF."""
     value, size, severity = deviation
     chosen = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
@@ -192,15 +198,15 @@ def format_estimate(name: str, chosen: float, noise: Noise) -> str:
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
-    """Format the action for a wrong setting of KF: the change whose re-run improves KF.
+    """Format the action for a wrong noise setting of KF.
 
     If no re-run could show an improvement, the action is a run with the estimate.
     """
-    if trial := find_trial(analysis.trials, "kf", "noises", name):
+    if trial := find_trial(analysis.main_trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
         trial.filter == "kf" and trial.change.keys() == {name} and can_improve(trial)
-        for trial in analysis.trials
+        for trial in analysis.main_trials
     ):
         return NO_IMPROVEMENT
     value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
@@ -208,9 +214,8 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 
 
 def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
-    """Return the deviation of a setting from its estimate; None if it is not significant."""
-    value = _value_or_bound(ml_noise)
-    if value is None:
+    """Compare a noise setting with its estimate; None without a significant difference."""
+    if not (value := ml_noise.value or ml_noise.high):
         return None
     low, high = (
         (0.0, value) if ml_noise.value is None else (ml_noise.low or 0.0, ml_noise.high or np.inf)
@@ -226,10 +231,10 @@ def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDevia
 
 
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
-    """Detect SIGMA_A so small that σ hardly grows between updates and KF ignores measurements.
+    """Detect a SIGMA_A so small that KF ignores new positions.
 
     Without motion a slow filter is correct, so the innovations must also be correlated and too
-    large. The main axis is tested first; at most one axis is reported.
+    large.
     """
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
@@ -241,13 +246,6 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         response_s = 1.0 / (sample_rate(updates) * gain)
         if response_s < MIN_RESPONSE_TIME_S:
             continue
-        variance_after = (
-            result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
-        )
-        variance_before = updates["prior_position_variance_m2"].to_numpy()
-        growth = float(
-            np.median((variance_before[1:] / variance_after[:-1] - 1.0)[len(variance_after) // 2 :])
-        )
         sigma_a = analysis.settings.sigma_a_m_s2
         axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
         title, estimate = f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero", ""
@@ -258,12 +256,11 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"{title}: KF ignores new positions. {estimate}The process noise is almost zero: the "
-            f"position variance grows by {format_percent(growth, 1)} between updates, and the gain "
-            f"falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a change.",
+            f"{title}: KF ignores new positions. {estimate}The process noise is almost "
+            f"zero, so the gain falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a "
+            "change.",
             action,
             {
-                "relative_growth": growth,
                 "gain": gain,
                 "response_s": response_s,
                 "axis": result.axis.name,
@@ -273,7 +270,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    """Detect inconsistent variances; that of the down axis follows the horizontal one."""
+    """Detect that KF or EKF2 is overconfident or underconfident."""
     for filter_name in FILTERS:
         for is_underconfident in (True, False):
             first_id = None
@@ -294,7 +291,7 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
 def _variance_finding(
     analysis: Analysis, filter_name: FilterName, group: str, members: list[Member]
 ) -> Finding:
-    """Make the finding of a group of axes, with numbers of the main or the worst axis."""
+    """Make the finding of an inconsistent filter along a group of axes."""
     result, summary = max(
         members,
         key=lambda pair: (pair[0] is analysis.main, abs(np.log(pair[1].nis_mean))),
@@ -322,7 +319,7 @@ def _variance_finding(
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
-        rerun = find_cause(analysis.causes, filter_name, result.axis.name)
+        rerun = find_cause(analysis.trials, filter_name, result.axis.name)
         cause = classify_cause(analysis, rerun)
         remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
@@ -333,29 +330,21 @@ def _variance_finding(
         "fraction_outside_gate": summary.fraction_outside_gate,
         CAUSE: cause,
     }
-    if axis_tuning is not None and (ml_sigma_z := _value_or_bound(axis_tuning.sigma_z)) is not None:
-        evidence["sigma_z_asked_m"] = ml_sigma_z
-        evidence["sigma_z_asked_is_upper_bound"] = float(axis_tuning.sigma_z.value is None)
     low, high = summary.nis_band
-    gate_effect = ""
-    if filter_name == "ekf2":
-        gate_effect = " The gate of EKF2 may then reject good positions."
-        if is_underconfident:
-            gate_effect = " The gate of EKF2 may then accept positions with large errors."
     return finding(
         severity,
         f"{filter_name}_{confidence}",
         f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
         f"{format_ratio(factor)} times too {'large' if is_underconfident else 'small'}. The mean "
         f"NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
-        f"axes).{gate_effect}",
+        "axes).",
         remedy_text,
         evidence,
     )
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    """Format the action if EKF2's GNSS noise exceeds the receiver's reported σ, else ""."""
+    """Format the action if EKF2's GNSS noise exceeds the σ that the receiver reports."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
@@ -400,21 +389,17 @@ def _has_default_noises(
     )
 
 
-def _value_or_bound(noise: Noise) -> float | None:
-    return noise.high if noise.value is None else noise.value
-
-
 def _remedy(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
     axis_tuning: AxisTuning | None,
-    cause: Intervention | None,
+    cause: Trial | None,
 ) -> str:
     if cause is not None and not is_refuted(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
-    reruns = interventions_for(analysis.causes, filter_name, result.axis.name)
-    if any(rerun.contradicts_truth for rerun in reruns):
+    reruns = find_trials(analysis.trials, filter_name, result.axis.name)
+    if any(contradicts_truth(rerun, "nis") for rerun in reruns):
         return KEEP_NOISES_TRUTH
     if axis_tuning is None:
         return UNKNOWN_NOISE
@@ -426,11 +411,11 @@ def _remedy(
 def _remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Format the action without a replay: compare EKF2's R with the estimated noise."""
-    aid, ml_noise_m = aid_of(analysis, result.axis.name), _value_or_bound(axis_tuning.sigma_z)
+    """Format the action from EKF2's R and the estimated noise."""
+    aid, noise = aid_of(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
-    if ml_noise_m is None:
+    if not (ml_noise_m := noise.value or noise.high):
         return NOT_EXPLAINED
     noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
     ratio = ekf2_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_m

@@ -11,7 +11,7 @@ from px4fuse.flight.model import Ekf2, Flight
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the recording, lost data first."""
+    """Detect faults of the recording."""
     yield from detect_dropouts(analysis)
     yield from detect_lost_data(analysis.flight)
     yield from detect_clocks_set_back(analysis.flight)
@@ -42,7 +42,7 @@ def detect_dropouts(analysis: Comparison) -> Findings:
 
 
 def detect_lost_data(flight: Flight) -> Findings:
-    """Detect unreadable bytes, a log that ends in flight, and samples in wrong order."""
+    """Detect unreadable bytes, a log that ends in flight, and wrong timestamps."""
     log = flight.log
     if log.damage or log.ends_in_flight:
         fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
@@ -77,7 +77,7 @@ def detect_lost_data(flight: Flight) -> Findings:
 
 
 def detect_clocks_set_back(flight: Flight) -> Findings:
-    """Detect restarts of the boot clock, and receive times that go back."""
+    """Detect restarts of the autopilot and receive times that go back."""
     log = flight.log
     if log.restarts:
         yield warning(
@@ -99,7 +99,7 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
 
 
 def detect_other_estimators(analysis: Analysis) -> Findings:
-    """Detect EKF2 data of px4fuse's model or another autopilot, or without innovations."""
+    """Detect an estimator that is not PX4's EKF2, and missing innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if MODEL_NOTE in log.notes:
         yield note(

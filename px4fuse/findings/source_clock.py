@@ -1,5 +1,7 @@
 """Time offset between position source and IMU, its change in flight, and a wrong EKF2_EV_DELAY."""
 
+import math
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
@@ -10,15 +12,17 @@ from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 
-MIN_OFFSET_S = 0.03  # s; offset for a warning; at 1 m/s a third of the noise of good UWB (0.1 m)
-MIN_OFFSET_ERROR_S = 0.10  # s; offset for an error; at 1 m/s the noise of good UWB (0.1 m)
-# Ratio of KF's position RMSE with over without a change, above which the change makes KF worse
+# Minimum time offset (s) for a warning: at 1 m/s a third of the noise of good UWB (0.1 m)
+MIN_OFFSET_S = 0.03
+# Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
+MIN_OFFSET_ERROR_S = 0.10
+# Maximum ratio of KF's position RMSE after and before the correction of a real time offset
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the timestamps at the sender."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong time offset or EKF2_EV_DELAY, unless EKF2 output is the position source."""
+    """Detect a wrong time offset of the positions, or a wrong EKF2_EV_DELAY."""
     clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
     if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
@@ -26,10 +30,8 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect a time offset between positions and IMU, or one that changes in flight."""
-    if (
-        find_low_pass(analysis) is not None
-    ):  # positions that are low-pass filtered lag without a time offset
+    """Detect a time offset between positions and IMU, constant or changing."""
+    if find_low_pass(analysis) is not None:  # a low pass delays positions without a time offset
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
@@ -38,9 +40,8 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         yield error(
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
-            f"{end_offset_s:+.2f} s. These are the estimates of the first and the last part "
-            f"(p {clock.change_p_value:.1g}). No single --clock-offset corrects both. Until 500 "
-            "TIMESYNC answers have come, PX4 uses arrival times.",
+            f"{end_offset_s:+.2f} s (p {clock.change_p_value:.1g}). No single --clock-offset "
+            "corrects both. Until 500 TIMESYNC answers have come, PX4 uses arrival times.",
             "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
             "change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},
@@ -51,7 +52,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     if (
         size_s <= max(MIN_OFFSET_S, clock.three_sigma_s)
         or find_synchronisation(analysis) is not None
-        or _contradicts_truth(_find_trial(analysis, "kf", "time offset"))
+        or _rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
     interval_s, is_late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
@@ -69,14 +70,14 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 
 def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | None:
-    return next((t for t in analysis.trials if (t.filter, t.kinds) == (owner, (kind,))), None)
+    return next((t for t in analysis.main_trials if (t.filter, t.kinds) == (owner, (kind,))), None)
 
 
-def _contradicts_truth(trial: Trial | None) -> bool:
-    if trial is None:
-        return False
-    before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
-    return before is not None and after is not None and after > MAX_RMSE_RATIO * before
+def _rmse_ratio(trial: Trial | None) -> float:
+    """Return the position RMSE after a change over that before; NaN without ground truth."""
+    if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
+        return math.nan
+    return trial.after.position_rmse_m / trial.before.position_rmse_m
 
 
 def _receiver_delay(analysis: Analysis) -> str | None:
@@ -95,7 +96,7 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action at the source; the card adds the actions for KF and EKF2."""
+    """Return the action at the sender."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
@@ -107,18 +108,18 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
-    """Return the value (s) for ``--clock-offset``: offset in use plus the estimated remainder.
+    """Return the value (s) for ``--clock-offset``.
 
-    For a position file, the offset in use is part of its alignment.
+    For a position file, the time offset that its alignment applied is added.
     """
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect EKF2_EV_DELAY that differs from the estimate by 3 σ and one EKF2 step."""
-    # EKF2_GPS_DELAY corrects GNSS timestamps, so the time offset already includes its error
-    # a position file is not what EKF2 fused, and its clock is aligned with EKF2's position
+    """Detect an EKF2_EV_DELAY that differs from the estimated delay."""
+    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY. EKF2 did not fuse a
+    # position file, and its clock is aligned with EKF2's position.
     is_fused = analysis.source.origin.is_vision and analysis.source.alignment is None
     delay_ms = remedy.delay_ms(analysis) if is_fused else None
     ml_delay_ms = -1e3 * clock.offset_s
@@ -164,7 +165,7 @@ def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
 
 def _improves(trial: Trial) -> bool:
     """Return True if a re-run reduces the position RMSE, without ground truth the mean NIS."""
-    before, after = trial.before, trial.after
-    if before.position_rmse_m is not None and after.position_rmse_m is not None:
-        return after.position_rmse_m < before.position_rmse_m
-    return bool(before.nis_mean and after.nis_mean and after.nis_mean < before.nis_mean)
+    nis_before, nis_after = trial.before.nis_mean, trial.after.nis_mean
+    if not math.isnan(ratio := _rmse_ratio(trial)):
+        return ratio < 1.0
+    return bool(nis_before and nis_after and nis_after < nis_before)

@@ -26,7 +26,7 @@ from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
 CORRECT_FIRST = "Correct the position source first."
-# Findings about EKF2's parameters or the alignment, which a wrong source makes false
+# Findings that are false if the source is wrong: they concern EKF2's parameters or the alignment
 FALSE_AFTER = (
     "ekf2_noise_too_small",
     "ekf2_noise_too_large",
@@ -38,7 +38,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Findings that remain true, with another action
+# Findings that remain true if the source is wrong, with CORRECT_FIRST as action
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -53,12 +53,12 @@ EFFECTS = (
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of the fault, message and action
+# Id of the finding, kind of fault, message and action
 Fault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect faults of the convention, the cause of others first."""
+    """Detect axes, units, timestamps and orientations in a wrong convention."""
     convention, faults = analysis.convention, _faults(analysis)
     if convention is None:
         return
@@ -75,34 +75,36 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings without those that a wrong convention makes false.
+    """Remove the findings that a wrong convention makes false.
 
-    Findings about EKF2, which fused what was sent, follow the fault as its effects.
+    Findings about EKF2 remain, as effects of the wrong convention.
     """
     faults = _faults(analysis)
-    roots = [one for one in findings if CONVENTION in one.evidence]
-    unusable = [one for one in findings if one.id in UNUSABLE]
+    roots = [item for item in findings if CONVENTION in item.evidence]
+    unusable = [item for item in findings if item.id in UNUSABLE]
     if unusable:
         roots = unusable
         findings = [
-            one
-            for one in findings
-            if one in unusable or one.id in EFFECTS or CATALOGUE[one.id].group in UNAFFECTED_GROUPS
+            item
+            for item in findings
+            if item in unusable
+            or item.id in EFFECTS
+            or CATALOGUE[item.id].group in UNAFFECTED_GROUPS
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         roots = []
-    roots += [one for one in findings if one.id in MISLEADING or ANNOUNCED in one.evidence]
+    roots += [item for item in findings if item.id in MISLEADING or ANNOUNCED in item.evidence]
     if not roots:
         return [*findings]
-    others = [one for one in findings if one not in roots and one.id not in FALSE_AFTER]
+    others = [item for item in findings if item not in roots and item.id not in FALSE_AFTER]
     if faults.is_ambiguous and not unusable:
-        return [*roots, *(one for one in others if one.id in EFFECTS or one.severity == "note")]
+        return [*roots, *(item for item in others if item.id in EFFECTS or item.severity == "note")]
     effects = [
-        replace(one, message=f"{one.title}.", remedy=CORRECT_FIRST, caused_by=roots[0].id)
-        for one in others
-        if one.id in EFFECTS and one.caused_by is None
+        replace(item, message=f"{item.title}.", remedy=CORRECT_FIRST, caused_by=roots[0].id)
+        for item in others
+        if item.id in EFFECTS and item.caused_by is None
     ]
-    return [roots[0], *effects, *roots[1:], *(one for one in others if one.id not in EFFECTS)]
+    return [roots[0], *effects, *roots[1:], *(item for item in others if item.id not in EFFECTS)]
 
 
 def _faults(analysis: Comparison) -> Faults:
@@ -112,7 +114,6 @@ def _faults(analysis: Comparison) -> Faults:
 def _position_faults(
     convention: Convention, faults: Faults, source: PositionTrack
 ) -> Iterator[Fault]:
-    """Describe the faults of axes, unit and clock."""
     positions, alignment = positions_of(source), source.alignment
     is_file = alignment is not None
     odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
@@ -200,7 +201,6 @@ def _position_faults(
 def _orientation_faults(
     orientation: OrientationConvention | None, faults: Faults, source: str
 ) -> Iterator[Fault]:
-    """Describe the fault of the orientation of a source with this name."""
     if orientation is None or not faults.orientation:
         return
     if faults.orientation == "copied":

@@ -1,17 +1,22 @@
 """Position frame in FRD or misaligned, EKF2 heading errors, and alignment of a position file."""
 
+import math
+
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first
-from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
+from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight.model import Ekf2, Unavailable, positions_of, source_name
 
-MIN_HEADING_SIGMAS = 4.0  # misalignment in σ; flights without a mistake reach 3.2
-MIN_HEADING_ERROR_DEG = 5.0  # °; real flights had errors of 3 to 4° of the magnetic heading
-LARGE_HEADING_ERROR_DEG = 15.0  # °, for an error: a quarter of the motion appears on the wrong axis
-# Topic with the positions that EKF2 has rotated into the frame of its state (EKF2.cpp)
+# Minimum misalignment in σ for a finding: flights without a fault reach 3.2
+MIN_HEADING_SIGMAS = 4.0
+# Minimum misalignment (°) for a finding: the magnetic heading of real flights is wrong by 3 to 4°
+MIN_HEADING_ERROR_DEG = 5.0
+# Minimum misalignment (°) for severity error: a quarter of the motion appears on the wrong axis
+LARGE_HEADING_ERROR_DEG = 15.0
+# Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
@@ -28,7 +33,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of positions in FRD: a note if EKF2 fuses the yaw of the source."""
+    """Make the finding of positions in the frame FRD."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
@@ -36,14 +41,16 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         f"{capitalise_first(positions_of(analysis.source))} are in FRD: their x axis is the "
         "heading at start, not north."
     )
-    action = f"Read north as the x axis of {name}."
+    detail, action = "", f"Read north as the x axis of {name}."
     if isinstance(fusing, Unavailable):
+        detail = f"The log does not show whether EKF2 fused the yaw of {name}."
         if log.has_ulog:
             action += " Add the ULog, which shows whether EKF2 uses the same frame."
-        detail = f"The recording does not show whether EKF2 fused the yaw of {name}."
-        return note("source_frame_frd", f"{fault} {detail}", action)
-    if fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR:
-        detail = f"EKF2 fused the yaw of {name}, so it uses the same frame."
+    elif (
+        fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR
+    ):
+        detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
+    if detail:
         return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
@@ -54,8 +61,8 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
-    """Detect a rotation between the motion in the positions and the motion in the IMU."""
-    rotation_deg, sigma_deg = _wrap_deg(heading.misalignment_deg), heading.sigma_deg
+    """Detect positions that move in another direction than the IMU measures."""
+    rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
         yield _drift_finding(analysis, heading)
         return
@@ -63,75 +70,53 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     if abs(rotation_deg) < limit_deg or _is_explained_by_bias(analysis):
         return
     positions = capitalise_first(positions_of(analysis.source))
-    title = f"{positions} are rotated by {rotation_deg:+.0f}° relative to EKF2's heading"
-    interval = (
-        f"The 95 % interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and "
-        "constant over the flight."
-    )
-    finding_id = "ekf2_heading_error"
+    finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
-        message = (
-            f"{title}. {interval} GNSS positions refer to true north, so the heading is wrong."
-        )
+        reason = "GNSS positions refer to true north, so the heading is wrong."
         action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
     elif analysis.source.name == IN_EKF2_FRAME:
-        message = (
-            f"{title}. {interval} EKF2 fused the positions in this frame; the IMU measures the "
-            "same motion in another direction."
-        )
-        action = (
-            "Align the positioning frame with north, or calibrate the magnetometer away from metal "
-            "and motors."
-        )
+        reason = "EKF2 fused them in this frame; the IMU measures the motion in another direction."
+        action = f"Align the positioning frame with north. Or: {CALIBRATE}"
     else:
-        finding_id = "source_frame_misaligned"
-        message = (
-            f"{positions} are rotated by {rotation_deg:+.0f}° relative to the IMU. {interval} "
-            "Either the positioning frame is not aligned with north, or the heading is wrong "
-            "(magnetometer)."
+        finding_id, reference = "source_frame_misaligned", "the IMU"
+        reason = (
+            "The positioning frame is not aligned with north, or the magnetic heading is wrong."
         )
-        action = (
-            f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent, or calibrate the "
-            "magnetometer."
-        )
+        action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
-            action = "Run again with --position-yaw auto, or calibrate the magnetometer."
+            action = "Run again with --position-yaw auto."
+        action += f" Or: {CALIBRATE}"
     yield finding(
         "error" if abs(rotation_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        message,
+        f"{positions} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
+        f"interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and constant "
+        f"over the flight. {reason}",
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
 
 
 def _is_explained_by_bias(analysis: Analysis) -> bool:
-    """Return True if an accelerometer bias explains the data as well as a rotation does."""
     fit = analysis.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
     return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
 
 
-def _wrap_deg(angle: float) -> float:
-    """Return the same direction between -180° and +180°."""
-    return (angle + 180.0) % 360.0 - 180.0
-
-
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first, last = heading.ends
-    angles = [_wrap_deg(part.heading_error_deg) for part in heading.ends]
+    angles = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
     change = last.heading_error_deg - first.heading_error_deg
     basis = f"the orientation of {source_name(analysis.source)}"
     if heading.by != "orientation":
         basis = "the positions and the IMU"
     possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = f"{CALIBRATE} Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+    action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
-        possible_cause = "a magnetometer near currents or steel"
-        action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
+        possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
     elif not analysis.flight.log.has_ulog:
-        action = f"{CALIBRATE} Or let the autopilot fuse the yaw of the source."
+        action = "Or let the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
@@ -140,29 +125,29 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
         f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
-        action,
+        f"{CALIBRATE} {action}",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,
             "from_s": first.start_s,
             "to_s": last.end_s,
             "p": max(heading.drift_p, 1e-300),
-            "p_limit": MAX_DRIFT_P_VALUE,
         },
     )
 
 
 def detect_uncertain_alignment(analysis: Analysis) -> Findings:
-    """Detect an uncertain frame, yaw or time of a position file."""
+    """Detect a position file whose frame, yaw or time offset is uncertain."""
     alignment = analysis.source.alignment
-    sentences_by_severity: dict[Severity, tuple[str, ...]] = {}
-    if alignment is not None:
-        sentences_by_severity = {"error": alignment.misplaced, "warning": alignment.warnings}
-    for severity, sentences in sentences_by_severity.items():
-        for sentence in sentences:
-            yield finding(
-                severity,
-                "position_file_alignment",
-                f"{capitalise_first(sentence.rstrip('.'))}.",
-                "Give --clock-offset, --position-frame and --position-yaw if you know them.",
-            )
+    if alignment is None:
+        return
+    severities: list[Severity] = ["error"] * len(alignment.misplaced)
+    severities += ["warning"] * len(alignment.warnings)
+    sentences = (*alignment.misplaced, *alignment.warnings)
+    for severity, sentence in zip(severities, sentences, strict=True):
+        yield finding(
+            severity,
+            "position_file_alignment",
+            f"{capitalise_first(sentence.rstrip('.'))}.",
+            "Give --clock-offset, --position-frame and --position-yaw if you know them.",
+        )

@@ -26,21 +26,28 @@ from px4fuse.flight.model import Ekf2, Unavailable, positions_of, step_values_at
 from px4fuse.flight.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
-MIN_LOST_SHARE = 0.02  # of the positions; PX4 v1.14 and later loses 0 to 0.3 %, v1.13 8 to 9 %
-MIN_INTERVALS = 50  # minimum number of intervals for the detection of downsampling
-MIN_DOWNSAMPLED_SHARE = 0.25  # of the positions that the source measured; a radio link loses less
-# Minimum fraction of intervals with both of two neighbouring multiples of the source's interval,
-# and with each of them. Downsampling to a fixed rate causes such intervals, lost messages do not
-MIN_NEIGHBOURS_SHARE, MIN_MULTIPLE_SHARE = 0.85, 0.1
-# Maximum RMS distance of the intervals from whole multiples (in source intervals): 0.29 if random,
-# 0.03 with the jitter of a source
+# Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
+MIN_LOST_SHARE = 0.02
+# Minimum number of intervals for the detection of downsampling
+MIN_INTERVALS = 50
+# Minimum fraction of missing positions for downsampling: a radio link loses less
+MIN_DOWNSAMPLED_SHARE = 0.25
+# Minimum fraction of intervals with one of two neighbouring multiples of the source's interval.
+# Downsampling to a fixed rate causes such intervals, lost messages do not
+MIN_NEIGHBOURS_SHARE = 0.85
+# Minimum fraction of intervals with each of these two multiples
+MIN_MULTIPLE_SHARE = 0.1
+# Maximum RMS distance of intervals from whole multiples, in intervals of the source: jitter causes
+# 0.03, random intervals 0.29
 MAX_MULTIPLE_RMS = 0.06
-MAX_DIVISOR = 4  # median interval over source interval that is tested
-# Minimum flight time without a source that begins or stops in flight: the land detector is seconds
-# late
+# Maximum tested ratio of the median interval to the interval of the source
+MAX_DIVISOR = 4
+# Minimum time (s) in flight without a source that begins late or stops: the land detector is
+# seconds late
 MIN_PARTIAL_S = 3.0
-SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position has not used the position
-# Things to check after a gap in the position source, by its kind
+# Time (s) before a position at which KF has not used the position yet
+SMALLEST_TIME_S = 1e-6
+# Text of the check after a gap in the position source, by kind of source
 CHECKS: Mapping[PositionKind, str] = {
     "uwb": "line of sight to the anchors and the link",
     "vio": "light and texture in view of the camera and the link",
@@ -58,7 +65,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
-    """Detect gaps in the position source, or in its log, and a source that does not last."""
+    """Detect times without positions: in the source, in the log, before or after the source."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
     spans, logged_spans = list[Span](), list[Span]()
     invalid_s = analysis.source.invalid.index
@@ -97,13 +104,12 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
 
 
 def _longest(gaps: list[Span]) -> tuple[float, float, str]:
-    """Return start and end (s) of the longest gap, and the text for more than one gap."""
     start_s, end_s = max(gaps, key=lambda gap: gap[1] - gap[0])
     return start_s, end_s, "" if len(gaps) == 1 else f", the longest of {len(gaps)} gaps"
 
 
 def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
-    """Return the option for a track that contains the gap, or else what to check."""
+    """Return the action for positions that EKF2 fused but the log lacks."""
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Add --position-source {track.name}, which contains these positions."
@@ -111,7 +117,7 @@ def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
 
 
 def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
-    """Make the finding of a source that begins or stops in flight, with EKF2's error then."""
+    """Make the finding of a source that begins or stops in flight."""
     (start_s, end_s), source = span_s, analysis.source
     stops = end_s == analysis.segment.flight.end_s
     event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")
@@ -139,7 +145,7 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
 
 
 def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's last horizontal error and reported σ (m) in a span, if they are known."""
+    """Return EKF2's horizontal error and reported σ (m) at the end of a span, if known."""
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squares_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
@@ -162,7 +168,7 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
 
 
 def state_errors_after(analysis: Analysis, gap_s: Span) -> str:
-    """State the aids that each filter used in a gap, and error and reported σ at its end."""
+    """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, (start_s, end_s) = analysis.main, gap_s
     before_end_s = np.array([start_s, end_s - SMALLEST_TIME_S])
     axis, ekf2 = result.axis, result.ekf2_state
@@ -201,7 +207,7 @@ def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
 
 
 def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
-    """Return the horizontal aids that EKF2 fused without a gap of half of the span (s)."""
+    """Return the horizontal aiding sources that EKF2 fused all over a time span."""
     aids, (start_s, end_s) = list[Aid](), span_s
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
@@ -220,7 +226,7 @@ def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
-    """Detect single positions of a regular source that the recording lacks."""
+    """Detect single positions that are missing from the recording."""
     source, clock = analysis.source, analysis.source.clock_map
     if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
         return
@@ -242,7 +248,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 
 
 def detect_downsampling(analysis: Analysis) -> Findings:
-    """Detect intervals that are whole multiples of a shorter one: PX4 misses positions."""
+    """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
     # neither mapped timestamps nor the rate of the logger show the intervals at the receiver
     if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
@@ -285,17 +291,14 @@ def detect_downsampling(analysis: Analysis) -> Findings:
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
-    """Return the intervals (s) between positions in the segment, without gaps; and their median."""
+    """Return the intervals (s) between positions without gaps, and the median interval."""
     intervals = np.diff(cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
     return intervals[intervals <= max_interval_s(typical)], typical
 
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:
-    """Return the interval (s) of the source, and the measured intervals as multiples of it.
-
-    None if the intervals are not whole multiples of one interval.
-    """
+    """Return the interval (s) of the source, and the measured intervals as multiples of it."""
     # the upper median is a measured interval, not a mean of two
     typical = float(np.sort(intervals)[len(intervals) // 2])
     for divisor in range(1, MAX_DIVISOR + 1):

@@ -19,18 +19,27 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
 
-MIN_CORRELATION_GAIN_NATS = 5.0  # log-likelihood gain; 1 of 400 flights without mistake exceeds it
-MIN_REPEAT_SHARE = 0.05  # of the positions, for a warning
-MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions, for an error: the true rate is clearly lower
+# Minimum gain of the log likelihood for time-correlated noise: 1 of 400 flights without a fault
+# exceeds it
+MIN_CORRELATION_GAIN_NATS = 5.0
+# Minimum fraction of repeated positions for a warning
+MIN_REPEAT_SHARE = 0.05
+# Minimum fraction of repeated positions for severity error
+MIN_REPEAT_SHARE_ERROR = 0.3
+# Minimum number of repeated positions for a finding
 MIN_REPEATS = 10
-MIN_AXIS_RATIO = 1.5  # position noise (σ) along the noisier axis over that along the other axis
-# Minimum ratio of σ between a noisier part of the flight and the rest: for a warning, with outliers
-# not fused, and for an error
-MIN_PART_RATIO, MIN_PART_RATIO_WITHOUT_OUTLIERS, MIN_PART_RATIO_ERROR = 2.0, 1.5, 4.0
+# Minimum ratio of the position noises (σ) along north and east for a finding
+MIN_AXIS_RATIO = 1.5
+# Minimum ratio of σ in a part of the flight and in the rest for a warning
+MIN_PART_RATIO = 2.0
+# Minimum ratio of σ in a part of the flight and in the rest if outliers are not fused
+MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5
+# Minimum ratio of σ in a part of the flight and in the rest for severity error
+MIN_PART_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect noise that R cannot describe; odometry and EKF2 output as source are not tested."""
+    """Detect position noise that is not white noise with a constant σ."""
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
@@ -72,7 +81,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
 
 
 def _exceeds_sigma(analysis: Analysis) -> bool:
-    """Return True if the mean NEES of a filter is above the consistent band."""
+    """Return True if a filter is overconfident against ground truth."""
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)

@@ -23,7 +23,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
 from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
-from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -37,25 +36,46 @@ from px4fuse.findings.source_stamps import detect_arrival_times
 from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
 from px4fuse.flight.position_source import PositionKind
 
-MIN_MOTION_RANGE_M = 0.5  # m; extent (5 to 95 % of the positions); below, the vehicle only hovers
-NOISE_RANGE_FACTOR = 1.25 * 3.29  # extent (5 to 95 %) of white noise in σ, with a margin of 25 %
-SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826  # median |second difference| over σ of white noise
-MIN_LOW_PASS_GAIN_NATS = 6.0  # log-likelihood gain; flights without a low pass have 0 to 2
-MIN_LAG_NATS = 1.0  # log-likelihood of a low pass minus that of time-correlated noise without lag
-MIN_LAG_S = 0.05  # s; lag for severity warning; at 1 m/s half of the noise of good UWB (0.1 m)
-MIN_LAG_ERROR_S = 0.10  # s; lag for severity error; at 1 m/s the noise of good UWB (0.1 m)
-MIN_JUMP_M = 0.2  # m; jump for severity warning: twice the noise of good UWB (0.1 m)
-MIN_JUMP_SIGMAS = 5.0  # jump in σ of the time-correlated noise, whose changes have up to √2 σ
-MAX_RESET_DISTANCE_S = 1.0  # s from a jump to its reset_counter; two intervals at 2 Hz
-MIN_JUMP_ERROR_M = 0.5  # m; jump for severity error: five times the noise of good UWB (0.1 m)
-MIN_SCALE = 0.12  # relative scale error for severity warning; correct simulated flights reach 0.11
-MIN_SCALE_ERROR = 0.15  # relative scale error for severity error: 1 m in 7 m
-MIN_SCALE_SIGMAS = 3.0  # scale error in σ of its estimate; 0.3 % of correct sources exceed it
-MIN_OUTLIER_SHARE = 0.005  # outliers over positions; normal noise has 0.02 % beyond 3.7 σ
-MIN_OUTLIER_SHARE_ERROR = 0.02  # for severity error: one outlier per 10 s at 5 Hz
+# Minimum extent (m) of the positions, from 5 to 95 %, for a vehicle that moves
+MIN_MOTION_RANGE_M = 0.5
+# Extent of white noise in σ, from 5 to 95 %, with a margin of 25 %
+NOISE_RANGE_FACTOR = 1.25 * 3.29
+# Ratio of the median absolute second difference to the σ of white noise
+SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
+# Minimum gain of the log likelihood for a low pass: flights without a low pass have 0 to 2
+MIN_LOW_PASS_GAIN_NATS = 6.0
+# Minimum log likelihood of a low pass relative to time-correlated noise without lag
+MIN_LAG_NATS = 1.0
+# Minimum lag (s) of a low pass, for a warning: at 1 m/s half of the noise of good UWB (0.1 m)
+MIN_LAG_S = 0.05
+# Minimum lag (s) of a low pass, for severity error: at 1 m/s the noise of good UWB (0.1 m)
+MIN_LAG_ERROR_S = 0.10
+# Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
+MIN_JUMP_M = 0.2
+# Minimum jump in σ of the time-correlated noise, which changes by up to √2 σ
+MIN_JUMP_SIGMAS = 5.0
+# Maximum time (s) between a jump and its reset_counter: two intervals at 2 Hz
+MAX_RESET_DISTANCE_S = 1.0
+# Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
+MIN_JUMP_ERROR_M = 0.5
+# Minimum scale error (ratio minus 1) for a warning: correct simulated flights reach 0.11
+MIN_SCALE = 0.12
+# Minimum scale error (ratio minus 1) for severity error: 1 m in 7 m
+MIN_SCALE_ERROR = 0.15
+# Minimum scale error in σ of its estimate: 0.3 % of correct sources exceed it
+MIN_SCALE_SIGMAS = 3.0
+# Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
+MIN_OUTLIER_SHARE = 0.005
+# Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
+MIN_OUTLIER_SHARE_ERROR = 0.02
+# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Reported over estimated variance of the positions, or its inverse, for severity warning and error
-MIN_VARIANCE_RATIO, MIN_VARIANCE_RATIO_ERROR = 2.0, 3.0
+# Minimum fraction of logged innovations for a count of the rejected outliers
+MIN_INNOVATION_SHARE = 0.75
+# Minimum ratio of reported and estimated position variance, or its inverse, for a warning
+MIN_VARIANCE_RATIO = 2.0
+# Minimum ratio of reported and estimated position variance, or its inverse, for severity error
+MIN_VARIANCE_RATIO_ERROR = 3.0
 # Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
@@ -97,7 +117,7 @@ OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the positions; odometry and EKF2 output are tested for some only."""
+    """Detect faults of the positions."""
     yield from detect_little_motion(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
@@ -108,7 +128,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
-    """Return the low-pass filter of the position source; None if none is identified."""
+    """Return the low-pass filter of the position source, if it has one."""
     source, low_pass = analysis.source, analysis.source_low_pass
     # drift of odometry also correlates successive errors, and EKF2 itself filters its positions
     if source.orientation is not None or source.origin.reconstructed:
@@ -128,12 +148,12 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
 
 
 def _is_clock_known(analysis: Analysis) -> bool:
-    """Return True if a time offset is estimated, so that late timestamps do not look like lag."""
+    """Return True if a lag is not caused by late timestamps."""
     return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_times(analysis))
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:
-    """Detect a low-pass filter of the source, which correlates errors and delays positions."""
+    """Detect positions that are low-pass filtered."""
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
         make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
@@ -226,7 +246,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers than normal noise has, without those next to a position jump."""
+    """Detect more outliers than normal noise has."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
@@ -259,7 +279,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
 
 
 def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
-    """Return the horizontal distances (m) of outliers from a reference, and its name.
+    """Return the horizontal errors (m) of outliers, and the name of the reference.
 
     The reference is ground truth, else the line between the positions before and after.
     """
@@ -279,7 +299,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
 
 
 def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
-    """State the number of outliers that EKF2 rejected; "" if the log does not show it."""
+    """Format the number of outliers that EKF2 rejected, if the log shows it."""
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
@@ -292,7 +312,7 @@ def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
 
 
 def detect_wrong_variance(analysis: Analysis) -> Findings:
-    """Detect a reported variance outside the 95 % interval of the position noise."""
+    """Detect a reported variance that differs from the estimated position noise."""
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
     # the noise of low-pass filtered positions is only part of their error
     may_be_low_passed = (
@@ -349,16 +369,16 @@ def _rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 
 def motion_range_m(comparison: Comparison) -> float:
-    """Return the larger extent (m) of the track along north or east, 5 to 95 %."""
+    """Return the larger horizontal extent (m) of the positions, 5 to 95 %."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
 
 
 def hardly_moved(comparison: Comparison) -> bool:
-    """Return True if the extent of the positions is below 0.5 m or explained by their noise.
+    """Return True if the extent of the positions is small, or explained by noise.
 
-    Second differences give the noise, because constant velocity does not change them.
+    The noise is estimated from second differences, which are zero at constant velocity.
     """
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]

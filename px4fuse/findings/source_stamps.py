@@ -11,12 +11,19 @@ from px4fuse.findings.model import Findings, error, fraction_on, note, warning
 from px4fuse.flight.log import SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
 
-MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
-MAX_ARRIVAL_AGE_S = 0.001  # s; PX4's time from receiving a message to publishing its position
-MIN_LATENCY_S = 0.02  # s; latency for a warning; at 1 m/s a fifth of the UWB noise (0.1 m)
-MIN_LATENCY_ERROR_S = 0.10  # s; latency for an error; at 1 m/s the UWB noise (0.1 m)
-MIN_SAMPLES = 10  # minimum number of positions with arrival times, and with measurement times
-MIN_CONSISTENT_SHARE = 0.95  # of these positions have this kind of timestamp; a few come late
+# Maximum jitter (s) of receive times without a finding: at 1 m/s a tenth of the noise of good UWB
+# (0.1 m)
+MAX_RECEIPT_JITTER_S = 0.010
+# Maximum age (s) of a position whose timestamp is its arrival time: PX4 publishes it within 1 ms
+MAX_ARRIVAL_AGE_S = 0.001
+# Minimum latency (s) for a warning: at 1 m/s a fifth of the noise of good UWB (0.1 m)
+MIN_LATENCY_S = 0.02
+# Minimum latency (s) for severity error: at 1 m/s the noise of good UWB (0.1 m)
+MIN_LATENCY_ERROR_S = 0.10
+# Minimum number of positions with arrival times, and of positions with measurement times
+MIN_SAMPLES = 10
+# Minimum fraction of positions with the same kind of timestamp: a few come late
+MIN_CONSISTENT_SHARE = 0.95
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -24,7 +31,7 @@ ANSWER_TIMESYNC = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect wrong timestamps, from the clock map of a recording or the ages in a ULog."""
+    """Detect timestamps that are not the time of measurement."""
     clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
@@ -48,7 +55,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:
-    """Make the finding of timestamps with a resolution coarser than the sample interval."""
+    """Make the finding of several positions with the same timestamp."""
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = count / (distinct_count * resolution_s)
     yield error(
@@ -63,7 +70,7 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
 
 
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
-    """Make the finding of timestamps that are not the autopilot's boot time in microseconds."""
+    """Make the finding of timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     effect = ""
@@ -82,7 +89,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
 
 
 def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
-    """Make the findings of constant timestamps and of jitter in receive times."""
+    """Make the findings of constant timestamps and of jitter in the receive times."""
     yield error(
         "source_timestamps_constant",
         f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
@@ -104,10 +111,10 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
 
 
 def detect_arrival_times(analysis: Analysis) -> Findings:
-    """Detect timestamps that are arrival times, in the whole flight or until TIMESYNC converged.
+    """Detect timestamps that are arrival times instead of times of measurement.
 
-    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). Publication time minus
-    timestamp of the positions is then zero instead of the latency.
+    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
+    when PX4 publishes it is then zero instead of the latency.
     """
     age = _age_s(analysis)
     if age is None:
@@ -144,15 +151,15 @@ def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
 
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
-    """Return the time (s) from which timestamps are measurement times, and the latency (s).
+    """Find the time (s) at which TIMESYNC converged, and the latency (s) of the positions.
 
-    None if timestamps do not change from arrival times to measurement times in flight.
+    Before this time the timestamps are arrival times. None without such a change.
     """
     age = _age_s(analysis)
     if age is None:
         return None
     is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # wrong_count: positions that contradict a change after each position
+    # for each position: number of timestamps of the wrong kind, if TIMESYNC converged just after it
     wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
     cut = int(np.argmin(wrong_count)) + 1
     if np.mean(is_arrival) >= MIN_CONSISTENT_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
@@ -167,7 +174,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the age (s) of each position when PX4 publishes it; None if not logged."""
+    """Return the age (s) of each position when PX4 publishes it, if logged."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:

@@ -17,17 +17,26 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, positions_of, source_name
 
-MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
-MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB
-MIN_OFFSET_SIGMAS = 4.0  # of the offset in one window; white noise of one sender has 1 to 2
-WINDOW = 16  # samples, of which a lost one reverses the order of two senders
-MIN_WINDOWS = 10  # with fewer, 1 of 60 flights at 2 Hz with 5 % outliers looks like two senders
-# Median difference (m) from EKF2's own position: of a source that EKF2 does not fuse, and of one
-# that it follows
-MAX_COPY_M, MAX_FOLLOWED_COPY_M = 0.01, 0.001
-MIN_COPY_SPEED_M_S = 0.2  # m/s; at rest any source may equal EKF2's position
-DELAYS_S = np.arange(0.0, 0.305, 0.005)  # s, from EKF2's position to the timestamp of its copy
-# Id of the finding, fault and action, by the reason why rows are no measurement
+# Minimum rounding step (m) for a finding: smaller steps cause an error (0.29 steps, 1 σ) below the
+# noise of UWB
+MIN_STEP_M = 0.05
+# Minimum distance (m) between two senders for a finding: the noise of good UWB
+MIN_OFFSET_M = 0.1
+# Minimum distance between two senders in σ of its estimate: white noise of one sender reaches 2
+MIN_OFFSET_SIGMAS = 4.0
+# Number of samples in which two senders alternate regularly; a lost sample reverses their order
+WINDOW = 16
+# Minimum number of windows: with fewer, outliers of one sender resemble two senders
+MIN_WINDOWS = 10
+# Maximum median distance (m) from EKF2's position of a copy that EKF2 does not fuse
+MAX_COPY_M = 0.01
+# Maximum median distance (m) from EKF2's position of a copy that EKF2 fuses, and so follows
+MAX_FOLLOWED_COPY_M = 0.001
+# Minimum speed (m/s) for the comparison with EKF2: at rest any source may equal EKF2's position
+MIN_COPY_SPEED_M_S = 0.2
+# Tested times (s) between EKF2's position and the timestamp of its copy
+DELAYS_S = np.arange(0.0, 0.305, 0.005)
+# Id of the finding, fault and action, by the reason why a row contains no measurement
 INVALID: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
@@ -57,7 +66,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    """Return the spans of consecutive rows without a valid sample between them."""
+    """Return the time spans of rows without a valid sample between them."""
     # rows of one span have the same valid sample before them
     before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(before, prepend=-1))
@@ -66,7 +75,7 @@ def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
 
 
 def detect_invalid_rows(analysis: Analysis) -> Findings:
-    """Detect rows of zeros, of a position that is held, and without a position."""
+    """Detect rows that contain zeros, a repeated last position, or no position."""
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID.items():
@@ -94,14 +103,14 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 
 def _valid_around(analysis: Analysis, span_s: Span) -> Span:
-    """Return the times of the last measurement before a span and of the first one after it."""
+    """Return the times of the last valid measurement before a span and the first one after it."""
     time_s = analysis.lines[0].measurement_time_s
     at = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[at[0] - 1]), float(time_s[at[1]])
 
 
 def detect_rounding(analysis: Analysis) -> Findings:
-    """Detect positions that are rounded to steps above their noise."""
+    """Detect positions that are rounded to coarse steps."""
     source, step_m = analysis.source, analysis.source.step_m
     if step_m < MIN_STEP_M:
         return
@@ -147,7 +156,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
-    """Detect positions of two systems in turn: every other position has a constant offset."""
+    """Detect two systems whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
     count, rate_hz = (len(samples) - 2) // WINDOW, analysis.source.rate_hz
@@ -215,7 +224,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
 
 
 def _difference_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
-    """Return the median distance of positions from EKF2's state in flight at other times."""
+    """Return the median distance (m) of positions from EKF2's position at other times."""
     at = state.index.to_numpy()
     curve = CubicHermiteSpline(at, state[Columns.POSITION], state[Columns.VELOCITY])
     is_moving = np.linalg.norm(curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.core.arrays import Array
@@ -100,7 +100,8 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
 
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M, axes=AXIS_NAMES)
-    kf_comparison = compare(prepare(flight, request))
+    prepared = prepare(flight, request)
+    kf_comparison = compare(prepared, run_kf(prepared))
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
     settings = kf_comparison.settings

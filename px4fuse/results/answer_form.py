@@ -1,4 +1,4 @@
-"""Answer form in which a student names the mistakes of a flight: questions, and reading.
+"""Answer form in which a student names the injected faults of a flight: questions, and reading.
 
 ``form.toml`` lists the allowed answers. Reading checks the syntax, not whether answers are right.
 """
@@ -18,16 +18,18 @@ from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, table
 from px4fuse.errors import SettingsError
 
-# Maximum size (bytes) of an answer form and maximum length (characters) of its lines: tomllib needs
-# seconds and gigabytes for a dotted key of 64 kB
-MAX_FORM_BYTES, MAX_LINE_LENGTH = 20_000, 500
+# Maximum size (bytes) of an answer form
+MAX_FORM_BYTES = 20_000
+# Maximum length (characters) of a line of an answer form: tomllib needs seconds and gigabytes for a
+# dotted key of 64 kB
+MAX_LINE_LENGTH = 500
 MAX_MISTAKES = 20
 NO_MISTAKE_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
 class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
-    """Mistake that a flight can have: description, quantity of its size, and allowed sizes.
+    """Injected fault that a flight can have: description, quantity of its size, and allowed sizes.
 
     ``range``: smallest and largest size, in the first unit of the quantity.
     """
@@ -56,7 +58,8 @@ class FormChoices(Record, frozen=True):
 _CHOICES = table(__file__, "form.toml", FormChoices)
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
-# Corrections of mistakes that a form can name, with the units of their values (empty: no value)
+# Corrections of injected faults that a form can name, with the units of their values (empty: no
+# value)
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 VERDICTS = ("consistent", "overconfident", "underconfident")
 
@@ -68,20 +71,21 @@ QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | 
 
 
 class StudentMistake(Record, frozen=True):
-    """Mistake of a flight that a student names in the answer form.
+    """Injected fault of a flight that a student names in the answer form.
 
     Attributes
     ----------
     kind : str
         One of :data:`MISTAKES`.
     size : float or None
-        Size of the mistake with sign, in ``unit``.
+        Size of the injected fault with sign, in ``unit``.
     when : str
         "whole flight", or empty if ``from_s`` and ``until_s`` (s since the first data) are given.
     parameter : str
-        Correction of the mistake, one of :data:`CORRECTIONS`, with its ``value`` in ``value_unit``.
+        Correction of the injected fault, one of :data:`CORRECTIONS`, with its ``value`` in
+        ``value_unit``.
     panel : str
-        Panel of the report that shows the mistake, one of :data:`PANELS`.
+        Panel of the report that shows the injected fault, one of :data:`PANELS`.
     """
 
     kind: str
@@ -96,7 +100,7 @@ class StudentMistake(Record, frozen=True):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Convert the size to the first unit of the mistake, such as a factor of 1.05 to 5 %."""
+        """Convert the size to the first unit of the fault, such as a factor of 1.05 to 5 %."""
         units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
@@ -136,7 +140,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
     @property
     def names_no_mistake(self) -> bool:
-        """True if the form states that the flight has no mistake."""
+        """True if the form states that the flight has no injected fault."""
         return [mistake.kind for mistake in self.mistakes] == [NO_MISTAKE_KIND]
 
 
@@ -261,7 +265,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def check_answers(answers: Answers) -> None:
-    """Raise ValueError if an answer is not allowed, out of range, or names a mistake twice."""
+    """Raise ValueError if an answer is not allowed, out of range, or names a fault twice."""
     kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)

@@ -39,7 +39,6 @@ _COPIED_FIELDS = (
     "ekf2_replay",
     "difference_steps",
     "trials",
-    "causes",
     "loop",
     "findings",
     "notes",

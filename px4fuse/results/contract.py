@@ -13,7 +13,6 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.card.model import Card
-from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
@@ -192,10 +191,8 @@ class ComparisonResults(_FlightResults, frozen=True):
         Changes of the difference KF - EKF2 by each replacement of one KF property by the EKF2
         property.
     trials : tuple of Trial
-        Re-runs along the aisle, else along the first axis, with all statistics before and after the
-        change.
-    causes : tuple of Intervention
-        Re-runs with one change each, and the fraction of an inconsistency that the change explains.
+        Re-runs with a change along the aisle, else along the first axis, and along each axis whose
+        mean NIS or NEES is outside its limits.
     aids : mapping of PX4's name to AidResult
         Aiding sources of EKF2 with statistics of their innovations; empty without innovations.
     loop : LoopResult
@@ -222,7 +219,6 @@ class ComparisonResults(_FlightResults, frozen=True):
     ekf2_replay: OrUnavailable[Replayed]
     difference_steps: dict[str, OrUnavailable[DifferenceSteps]]
     trials: tuple[Trial, ...]
-    causes: tuple[Intervention, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[LoopResult]
     card: Card

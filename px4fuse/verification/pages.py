@@ -58,9 +58,10 @@ MAX_KERNING = 200.0
 # Maximum ratio of submitted to redrawn page content (bytes): PDF may write a character as four
 # bytes
 MAX_CONTENT_RATIO = 4
-# Maximum time (s) and memory (bytes) for comparing two PDFs: the largest report needs 3 s and 0.3
-# GB
-TIMEOUT_S, MAX_MEMORY_BYTES = 12.0, 1_000_000_000
+# Maximum time (s) for comparing two PDFs; the largest report needs 3 s
+TIMEOUT_S = 12.0
+# Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
+MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
 # PDF dictionary keys that are not compared, because programs that save a PDF again change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))

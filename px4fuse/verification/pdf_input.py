@@ -30,8 +30,9 @@ from px4fuse.verification.model import BAD_VALUE_ERRORS
 
 MAX_PDF_BYTES = 25_000_000
 MAX_PAGES = 100
-# Maximum size (bytes) of one inflated PDF stream, and of all inflated streams together
+# Maximum size (bytes) of one inflated PDF stream
 MAX_CONTENT_BYTES = 20_000_000
+# Maximum size (bytes) of all inflated streams of a PDF together
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_PDF_OBJECTS = 20_000
 MAX_PDF_VALUES = 1_000_000

@@ -46,14 +46,19 @@ LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Relative and absolute tolerance of equal numbers. On another processor, sums over a flight differ
-# in the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS kernels differ
-# by at most 3e-8 (six flights)
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9
-# Relative and absolute tolerance of estimates, which minimise a likelihood or cost. Minima are
-# flat: if the cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends
-# of its 95 % interval in the 4th. Pages print up to three digits
-ESTIMATE_RELATIVE_TOLERANCE, ESTIMATE_ABSOLUTE_TOLERANCE = 1e-3, 1e-5
+# Maximum relative difference of equal numbers. On another processor, sums over a flight differ in
+# the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS kernels differ by
+# at most 3e-8 (six flights)
+RELATIVE_TOLERANCE = 1e-6
+# Maximum absolute difference of equal numbers near zero
+ABSOLUTE_TOLERANCE = 1e-9
+# Maximum relative difference of equal estimates, which minimise a cost. Minima are flat: if the
+# cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends of its 95 %
+# interval in the 4th. Pages print up to three digits
+ESTIMATE_RELATIVE_TOLERANCE = 1e-3
+# Maximum absolute difference of equal estimates near zero
+ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
+# Beginnings of the paths of estimates in the results
 ESTIMATE_PATHS = (
     "tuning",
     "clock",
@@ -67,9 +72,11 @@ ESTIMATE_PATHS = (
     "source.alignment",
     "settings.clock_offset_s",
 )
-# Results field with the number of solver iterations, and maximum difference of two numbers of
-# iterations that count as equal
-ITERATIONS_FIELD, MAX_MORE_ITERATIONS = "iterations", 2
+# Results field with the number of iterations of a solver
+ITERATIONS_FIELD = "iterations"
+# Maximum difference of two numbers of iterations: the solver stops at another step on other
+# processors
+MAX_MORE_ITERATIONS = 2
 # Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
@@ -326,7 +333,7 @@ def _verify_with_log(
 
 
 def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
-    """Return True if two printed numbers are roundings of the two results of one of the pairs.
+    """Return True if a printed number and its redrawn number are roundings of one pair of results.
 
     A pair contains a recorded and a recomputed result that are equal within the tolerances.
     """

@@ -216,10 +216,10 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     comparison = compare(flight, condition.settings, axes=("north", "east"))
     estimates = estimate(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
-    causes, trials = run_interventions(comparison, estimates, model)
+    trials = run_interventions(comparison, estimates, model)
     return Analysis(
         **vars(comparison), **vars(estimates), ekf2_model=model, difference_steps={},
-        causes=causes, trials=trials, events=collect_events(comparison),
+        trials=trials, events=collect_events(comparison),
         aids=evaluate_aids(flight), loop=analyse_flight_loop(flight),
     )  # fmt: skip
 

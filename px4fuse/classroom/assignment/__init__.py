@@ -1,1 +1,1 @@
-"""Assignments: a simulated flight with mistakes for each student, and the answer key."""
+"""Assignments: a simulated flight with injected faults for each student, and the answer key."""

@@ -90,7 +90,7 @@ def assign(
     secret : bytes or None
         None for the secret in the existing key, or for a new random secret.
     count : int, optional
-        Number of mistakes per flight; drawn at random by default.
+        Number of injected faults per flight; drawn at random by default.
     truth : bool
         True if the logs of aisle flights contain the ground truth.
     progress : callable
@@ -106,7 +106,7 @@ def assign(
     Raises
     ------
     SettingsError
-        One flight cannot have this many mistakes.
+        One flight cannot have this many injected faults.
     OutputError
         A file exists with other content, or cannot be written.
     """
@@ -155,7 +155,7 @@ def preview(
     Raises
     ------
     SettingsError
-        One flight cannot have this many mistakes, or no secret was given or stored.
+        One flight cannot have this many injected faults, or no secret was given or stored.
     """
     if secret is None:
         stored_key = read_key(key_file) if key_file.exists() else None

@@ -1,4 +1,4 @@
-"""Answer key of an assignment: flight, mistakes and right answers for each student."""
+"""Answer key of an assignment: flight, injected faults and right answers for each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -26,7 +26,7 @@ _Texts = Annotated[
 
 
 class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
-    """Assigned flight of one student, with its mistakes and the right answers.
+    """Assigned flight of one student, with its injected faults and the right answers.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     scenario : dict
         Fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
-        Values of ``px4fuse simulate --mistake``; empty for a flight without a mistake.
+        Values of ``px4fuse simulate --mistake``; empty for a flight without an injected fault.
     truth : dict
         True values of the simulation that the log does not contain, for example ``sigma_z_m``.
     difficulty : float or None

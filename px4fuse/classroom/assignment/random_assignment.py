@@ -1,4 +1,4 @@
-"""Random assignment of a flight with mistakes to each student.
+"""Random assignment of a flight with injected faults to each student.
 
 Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. The
 numbers cannot be predicted without the secret, and a second run gives the same flights.
@@ -28,28 +28,31 @@ MIN_SECRET_LENGTH = 8
 # First part of each HMAC message. Another label would change all flights, so that students could
 # not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
-# Fractions of flights with 0, 1 and 2 mistakes, unless --mistakes sets the number. The only
-# possible mistake of a loop is "open-end". Many loops have no mistake, so that students cannot
-# guess "open-end"
+# Fractions of flights with 0, 1 and 2 injected faults, unless --mistakes sets the number. The only
+# possible injected fault of a loop is "open-end". Many loops have no injected fault, so that
+# students cannot guess "open-end"
 COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
-# Limits of the difficulty of a mistake: smallest detectable size divided by the size in the flight
-EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
+# Minimum difficulty of an injected fault: smallest detectable size divided by the size in the
+# flight
+EASIEST_DIFFICULTY = 0.6
+# Maximum difficulty of an injected fault: its size in the flight is the smallest detectable size
+HARDEST_DIFFICULTY = 1.0
 
 
 class AssignableMistake(Record, frozen=True):
-    """Mistake of a simulated flight that can be assigned to a student.
+    """Injected fault of a simulated flight that can be assigned to a student.
 
     Attributes
     ----------
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
     group : str
-        Two mistakes of one group are not assigned together: one would hide the other.
+        Two injected faults of one group are not assigned together: one would hide the other.
     detectable_size : float or None
         Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
-        (tests/studies/rates.csv); None for a mistake without a size.
+        (tests/studies/rates.csv); None for an injected fault without a size.
     unit : str
         Unit of ``detectable_size``, as in ``px4fuse simulate --mistake``.
     is_smaller_easier : bool
@@ -57,9 +60,9 @@ class AssignableMistake(Record, frozen=True):
     has_either_sign : bool
         True if the sign of the size is drawn at random.
     start_range_s : (float, float) or None
-        Earliest and latest start (s) of a mistake that does not last the whole flight.
+        Earliest and latest start (s) of an injected fault that does not last the whole flight.
     hidden_groups : tuple of str
-        Groups of mistakes that cannot be detected in a flight with this mistake.
+        Groups of injected faults that cannot be detected in a flight with this injected fault.
     """
 
     mistake: str
@@ -72,7 +75,7 @@ class AssignableMistake(Record, frozen=True):
     hidden_groups: tuple[str, ...] = ()
 
     def is_detectable_with(self, other_mistake: AssignableMistake) -> bool:
-        """Return True if both mistakes can be detected in the same flight."""
+        """Return True if both injected faults can be detected in the same flight."""
         is_hidden = other_mistake.group in (self.group, *self.hidden_groups)
         return not is_hidden and self.group not in other_mistake.hidden_groups
 
@@ -101,7 +104,7 @@ class DrawingRules(Record, frozen=True):
     Attributes
     ----------
     mistakes : tuple of AssignableMistake
-        Possible mistakes.
+        Possible injected faults.
     numbers : dict
         Minimum, maximum and decimals of random numbers, by field of the scenario.
     """
@@ -125,8 +128,9 @@ class AssignedFlight:
     mistake_options : tuple of str
         Values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Largest difficulty of the mistakes: smallest detectable size divided by the size. A flight
-        without a mistake is the most difficult, because all mistakes have to be excluded.
+        Largest difficulty of the injected faults: smallest detectable size divided by the size. A
+        flight without an injected fault is the most difficult, because all injected faults have to
+        be excluded.
     """
 
     scenario: Scenario
@@ -151,7 +155,7 @@ def draw(
     kind : {"aisle", "loop", "mixed"}
         "mixed" draws aisle or loop.
     count : int, optional
-        Number of mistakes; drawn at random by default.
+        Number of injected faults; drawn at random by default.
     truth : bool
         True to log the ground truth of aisle flights. The log of a loop never contains it, because
         the ground truth shows the landing place.
@@ -159,7 +163,7 @@ def draw(
     Raises
     ------
     SettingsError
-        One flight cannot have this many mistakes.
+        One flight cannot have this many injected faults.
     """
     possible_kinds = COUNT_FRACTIONS if kind == "mixed" else (kind,)
     max_count = min(len(COUNT_FRACTIONS[each]) for each in possible_kinds) - 1

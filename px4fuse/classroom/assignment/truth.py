@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare
@@ -29,30 +29,32 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# Relative tolerance of the size of a mistake in a right answer
+# Relative tolerance of the size of an injected fault in a right answer
 SIZE_TOLERANCE = 0.15
 # Tolerance (m) of the loop closure error in a right answer
 CLOSURE_TOLERANCE_M = 0.3
 # Minimum fraction of samples rejected by EKF2 for which a complete answer must name rejections
 MIN_REJECTED_FRACTION = 0.005
-# Minimum position reset of EKF2 (m) that a complete answer must name, and time (s) after the start
-# in which resets are ignored, because EKF2 resets to its first position
-MIN_RESET_M, EKF2_START_S = 0.2, 5.0
-# Answers of the form on EKF2's behaviour, and kinds of mistakes that require or allow each
+# Minimum position reset of EKF2 (m) that a complete answer must name
+MIN_RESET_M = 0.2
+# Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
+EKF2_START_S = 5.0
+# Injected faults that require or allow an answer about the behaviour of EKF2, by rule and answer
 BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class TrueMistake(Record, frozen=True):
-    """Mistake of a simulated flight, with the limits of right answers.
+    """Injected fault of a simulated flight, with the limits of right answers.
 
     Attributes
     ----------
     size : float or None
-        Size in the first unit of the mistake in ``form.toml``.
+        Size in the first unit of the injected fault in ``form.toml``.
     low, high : float or None
         Smallest and largest size that is a right answer.
     from_s, until_s : float or None
-        Start and end of the mistake (s since the first data); both None for the whole flight.
+        Start and end of the injected fault (s since the first data); both None for the whole
+        flight.
     """
 
     kind: str
@@ -79,7 +81,7 @@ class FormTruth(Record, frozen=True):
     Attributes
     ----------
     mistakes : tuple of TrueMistake
-        Mistakes of the flight.
+        Injected faults of the flight.
     sigma_z_m : float
         True noise of the position source (m, 1 σ).
     kf, ekf2 : VerdictTruth
@@ -105,7 +107,8 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     answer = flights.answer(simulation)
     flight = flights.to_flight(simulation)
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
-    comparison = compare(prepare(flight, request))
+    prepared = prepare(flight, request)
+    comparison = compare(prepared, run_kf(prepared))
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()

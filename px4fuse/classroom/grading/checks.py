@@ -29,7 +29,6 @@ from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
     TUNED_FIELDS,
     ComparisonResults,
-    LoopResults,
     ReportedResults,
     to_plain,
 )
@@ -63,12 +62,15 @@ class RubricItem(
         Maximum points.
     report : {"any", "compare", "loop"}
         Command that makes the reports to which the item applies.
+    command : {"any", "compare", "loop"}
+        Command that makes the reports that the check can score.
     needs_key : bool
         True if the item is used only with an answer key.
     by_hand : bool
         True if the instructor scores the item.
     """
 
+    command: ClassVar[str] = "any"
     needs_key: ClassVar[bool] = False
     by_hand: ClassVar[bool] = False
 
@@ -82,7 +84,8 @@ class RubricItem(
 
     def applies(self, kind: str, key: AnswerKey | None) -> bool:
         """Return True if the item scores reports of the command ``kind`` (compare or loop)."""
-        return self.report in ("any", kind) and (key is not None or not self.needs_key)
+        has_key = key is not None or not self.needs_key
+        return has_key and {self.report, self.command} <= {"any", kind}
 
 
 def fraction_for_deviation(deviation_factor: float, factor: float) -> float:
@@ -112,9 +115,10 @@ class CheckInput:
     submitter_id: str = ""
 
     @property
-    def comparison(self) -> ComparisonResults | None:
-        """Results of a compare report; None for a loop report."""
-        return None if isinstance(self.results, LoopResults) else self.results
+    def comparison(self) -> ComparisonResults:
+        """Results of a compare report."""
+        assert isinstance(self.results, ComparisonResults)
+        return self.results
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -170,14 +174,9 @@ class CheckInput:
             return "the answer key contains no right answers to the form"
         return form_points(self.form, self.answer.form)
 
-    def names_mistake(self, *kinds: str) -> bool:
-        """Return True if the student's answer form names a mistake of one of these kinds."""
-        form = self.form
-        return isinstance(form, Answers) and any(mistake.kind in kinds for mistake in form.mistakes)
-
-    def has_finding(self, finding: str) -> bool:
-        """Return True if the report contains a finding with this id."""
-        return any(recorded.id == finding for recorded in self.results.findings)
+    def has_finding(self, *ids: str) -> bool:
+        """Return True if the report contains a finding with one of these ids."""
+        return any(finding.id in ids for finding in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
         """Return the reason why a value is missing, in brackets; "" if the results state none."""
@@ -213,9 +212,6 @@ def format_reason(reason: str) -> str:
 
 
 # ------------------------------------------------------------------ checks of any report
-
-
-NO_COMPARISON: FractionAndReason = (0.0, "Your report is not a compare report.")
 
 
 class VerifiedItem(RubricItem, frozen=True, tag="verified"):
@@ -329,19 +325,18 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 class TuningItem(RubricItem, frozen=True, tag="tuning"):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate."""
 
+    command: ClassVar[str] = "compare"
+
     setting: Sigma
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         """Return 1 within the 95 % interval, and 0 if the noise is outside by ``factor``."""
-        if check_input.comparison is None:
-            return NO_COMPARISON
-        return _score_tuning(check_input, check_input.comparison, self.setting, self.factor)
+        return _score_tuning(check_input, self.setting, self.factor)
 
 
-def _score_tuning(
-    check_input: CheckInput, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
-) -> FractionAndReason:
+def _score_tuning(check_input: CheckInput, name: Sigma, factor: float = 2.0) -> FractionAndReason:
+    comparison = check_input.comparison
     label, unit, option = NOISE_SETTINGS[name]
     chosen_value: float = getattr(comparison.settings, name)
     horizontal_tuning = comparison.tuning.get(HORIZONTAL)
@@ -350,10 +345,7 @@ def _score_tuning(
         reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
-    may_drift = check_input.has_finding("source_may_drift") or check_input.has_finding(
-        "source_drift"
-    )
-    if name == "sigma_z_m" and may_drift:
+    if name == "sigma_z_m" and check_input.has_finding("source_may_drift", "source_drift"):
         # innovations do not show the drift of a source, so each SIGMA_Z up to the error of KF is
         # right
         high = max(high, _largest_source_error_m(comparison))
@@ -386,14 +378,13 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
     A reported σ that is too small or too large by ``factor`` or more gives no points.
     """
 
+    command: ClassVar[str] = "compare"
+
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         """Score the verdict on the joint NIS of KF along north and east."""
-        comparison = check_input.comparison
-        if comparison is None:
-            return NO_COMPARISON
-        nis_result = comparison.horizontal.get("kf")
+        nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
             return 0.0, f"Your report has no verdict on KF{reason_text}."
@@ -402,7 +393,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
         side = "small" if nis_result.nis_mean > 1.0 else "large"
         factor_text = format_factor(nis_result.sigma_error_factor)
         statement = f"The reported σ of KF is {factor_text} times too {side}"
-        if all(_score_tuning(check_input, comparison, name)[0] == 1.0 for name in NOISE_SETTINGS):
+        if all(_score_tuning(check_input, name)[0] == 1.0 for name in NOISE_SETTINGS):
             return 1.0, (
                 f"{statement}. SIGMA_A and SIGMA_Z are within their 95 % intervals, so other "
                 "settings do not make KF consistent."
@@ -421,13 +412,13 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
     ``margin_s``: accepted distance (s) of the applied offset from its 95 % interval.
     """
 
+    command: ClassVar[str] = "compare"
+
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         """Return 1 if applied and estimated time offset agree, else 0 or ``undeterminable``."""
-        if check_input.comparison is None:
-            return NO_COMPARISON
         clock = check_input.comparison.clock
         if not isinstance(clock, Clock) or not clock.is_determinable:
             fraction = self.undeterminable if isinstance(clock, Clock) else 0.0
@@ -438,8 +429,9 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
         statement = f"You applied a time offset of {applied_s:.3f} s"
         if low - self.margin_s <= applied_s <= high + self.margin_s:
             return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
-        if any(map(check_input.has_finding, CHANGING_CLOCK_FINDINGS)):
-            if check_input.names_mistake("clock-jump", "clock-drift"):
+        if check_input.has_finding(*CHANGING_CLOCK_FINDINGS):
+            mistakes = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
+            if any(mistake.kind in ("clock-jump", "clock-drift") for mistake in mistakes):
                 return 1.0, "The time offset changes in your flight, as your form states."
             statement = "The time offset changes in your flight. State the time in your form."
             return self.undeterminable, statement

@@ -145,9 +145,7 @@ def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Ro
     count = len(entry.flags)
     flag_count_text = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = report.submission if report else ""
-    late_s = entry.late_s or 0.0
-    minutes_text = f"{math.ceil(late_s / 60.0)} min late" * bool(late_s)
-    late_text = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes_text
+    late_text = f"{math.ceil(entry.late_s / 60.0)} min late" if entry.late_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
@@ -193,12 +191,10 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
         f"{name}: {'named' if is_named else 'not named'} in the answer form"
         for name, is_named in report.mistakes.items()
     ]
-    attempts = [
-        f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
-    ]
+    attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
     yield frame.list_section("Flags", entry.flags, is_warning=True)
-    actions = list(filter(None, [report.instructor_action]))
-    yield frame.list_section("Pending: action required", actions, is_warning=True)
+    actions = [report.instructor_action] if report.instructor_action else []
+    yield frame.list_section("Your decision before the points count", actions, is_warning=True)
     yield frame.list_section("Verification", verdict.reasons)
     titles = ("Value", "Report", "New run") if differences else ()
     yield frame.table_section("Numbers that differ", titles, differences)
@@ -221,15 +217,12 @@ def _points_cell(entry: Entry) -> Cell:
             else ""
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
-    fraction = (
-        min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
-    )
     notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
     notes += ["set by instructor"] * any(
         override.points is not None for override in entry.overrides.values()
     )
     text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
-    return Cell(text, entry.total, ", ".join(notes), "", fraction)
+    return Cell(text, entry.total, ", ".join(notes))
 
 
 def _point_boxes(entry: Entry) -> Section:

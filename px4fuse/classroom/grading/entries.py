@@ -38,7 +38,6 @@ TIME_FORMAT = "%Y-%m-%d %H:%M"
 OVERRIDES_NAME = "overrides.csv"
 OVERRIDE_TITLES = ("id", "item", "points", "comment")
 OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
-MAX_OVERRIDE_POINTS = 1e6
 MAX_COMMENT_LENGTH = 10_000
 
 # Points or comment of the instructor, by student id and item title as typed ("": the whole report)
@@ -64,14 +63,11 @@ class LateRule:
         Unit of time: a day or an hour (s).
     max_fraction : float
         Largest fraction of the maximum points that is deducted.
-    text : str
-        Rule as the instructor typed it.
     """
 
     fraction_per_unit: float
     unit_s: float
     max_fraction: float
-    text: str
 
     def deduction(self, late_s: float, max_points: float) -> float:
         """Compute the points to deduct from a submission that is late by ``late_s`` seconds.
@@ -388,9 +384,7 @@ def read_overrides(path: Path) -> Overrides:
         if item_title in overrides[student]:
             item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"a second row for student {one_line(student, 40)}, item {item_text}"
-        elif points and (
-            value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item_title
-        ):
+        elif points and (value is None or value < 0.0 or not item_title):
             points_text = one_line(points, 20)
             problem = f"points {points_text!r}: give a number of 0 or more, and an item or total"
         if problem:
@@ -413,7 +407,7 @@ def match_overrides(
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
     all_points = (report.max_points for entry in entries for report in entry.reports)
-    max_total = max(all_points, default=MAX_OVERRIDE_POINTS)
+    max_total = max(all_points, default=math.inf)
     people = Register(
         Person(entry.student_id, login=report.submission if report else "")
         for entry in entries
@@ -427,7 +421,7 @@ def match_overrides(
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        max_by_title = {TOTAL_TITLE: max_total, "": MAX_OVERRIDE_POINTS}
+        max_by_title = {TOTAL_TITLE: max_total, "": math.inf}
         if report := entries[student_index].counted_report:
             max_by_title |= {item.title: item.max_points for item in report.items}
             max_by_title[TOTAL_TITLE] = report.max_points
@@ -463,7 +457,7 @@ def parse_late_rule(text: str) -> LateRule:
         raise SettingsError(f"--late {text!r} is not a rule. Use 10%/day or 10%/day up to 50%.")
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
     max_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
-    return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction, text.strip())
+    return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction)
 
 
 def parse_due_time(text: str) -> datetime:

@@ -7,27 +7,26 @@ px4fuse get the same settings.
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
-from itertools import combinations
+from itertools import chain, combinations, permutations
 from operator import attrgetter
 from typing import Any
 
 from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.core.text import capitalise_first, join_first, one_line
-from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verdict
 
-# Minimum number of equal numbers in two answer forms that are flagged as copies, and relative
-# tolerance of equal numbers, which detects a copy with small changes
-MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
-# Minimum fraction of the log between --start and --end: a report on a shorter segment is flagged
+# Minimum number of equal numbers in two answer forms for flagging them as copies
+MIN_SAME_NUMBERS = 3
+# Maximum relative difference of equal numbers: a copy may have small changes
+SAME_NUMBER_TOLERANCE = 0.02
+# Minimum fraction of the log between --start and --end of a report without a flag
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, above or below
-MAX_SETTING_FACTOR = 30.0
-# Maximum factor between --drift or --heading-drift and its default value, above or below
+# Maximum factor between --drift or --heading-drift and its default value, for a report without a
+# flag
 MAX_DRIFT_FACTOR = 4.0
 # Maximum number of reports with equal contents that a flag lists
 MAX_LISTED_REPORTS = 4
@@ -62,8 +61,6 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
             f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the reason."
         )
-    if not {"north", "east", "aisle"} & set(results.axes):
-        yield "Only the vertical axis was analysed (--axis)."
     without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
@@ -74,19 +71,6 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
-    estimates = [
-        estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
-    ]
-    for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
-        value = getattr(settings, name)
-        ml_values = [ml_value for estimate in estimates if (ml_value := getattr(estimate, name))]
-        if ml_values and not (
-            min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(ml_values)
-        ):
-            yield (
-                f"{label} {value:g} differs by more than a factor of {MAX_SETTING_FACTOR:g} from "
-                f"its maximum-likelihood estimate ({ml_values[0]:.3g})."
-            )
     if results.log.hardware == flights.HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
 
@@ -109,7 +93,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers in an answer form, by (mistake, "size" or "value") or ("", question)."""
+    """Return the numbers in an answer form, by (fault, "size" or "value") or ("", question)."""
     if report.form is None:
         return {}
     answers: dict[tuple[str, str], object] = {
@@ -175,15 +159,9 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
         ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
     ):
         texts_by_submission: dict[str, list[str]] = defaultdict(list)
-        for first_report, second_report in pairs:
-            for report, other_report in (
-                (first_report, second_report),
-                (second_report, first_report),
-            ):
-                file = one_line(other_report.submission, 80)
-                texts_by_submission[report.submission].append(
-                    f"{_student_text(other_report)} ({file})"
-                )
+        for report, other_report in chain.from_iterable(map(permutations, pairs)):
+            file = one_line(other_report.submission, 80)
+            texts_by_submission[report.submission].append(f"{_student_text(other_report)} ({file})")
         for name, texts in texts_by_submission.items():
             flags_by_submission[name].append(
                 sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))

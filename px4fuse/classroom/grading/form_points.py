@@ -1,13 +1,14 @@
 """Points of a student's answer form (0 to 100), by comparison with the answer key.
 
 The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each false
-mistake (named in the form, but not in the flight) costs points, and a mistake that can be guessed
-without a measurement has points only with the correct size.
+injected fault (named in the form, but not in the flight) costs points, and an injected fault that
+can be guessed without a measurement has points only with the correct size.
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgspec
 
@@ -21,42 +22,43 @@ from px4fuse.results.answer_form import (
     StudentMistake,
 )
 
-# Deduction (points) for each false mistake, which the flight does not have, and number of false
-# mistakes from which the right ones have no points either
-FALSE_MISTAKE_POINTS, MAX_FALSE_MISTAKES = 10.0, 3
-# Fractions of the points if the answer form names another mistake: a related mistake; ekf2-noise
-# for r-scale, which both make the same R wrong; a consequence of the mistake
-NEIGHBOUR_FRACTION, SAME_NUMBER_FRACTION, EFFECT_FRACTION = 0.4, 2.0 / 3.0, 0.15
-# Mistakes that can be guessed without a measurement: only the correct size has points. A nearly
-# correct size has no points, because the assigned sizes are close to each other
+# Points that are deducted for each false fault, which the flight does not have
+FALSE_MISTAKE_POINTS = 10.0
+# Number of false faults in an answer form from which its right faults have no points either
+MAX_FALSE_MISTAKES = 3
+# Fraction of the points if the answer form names a related injected fault
+NEIGHBOUR_FRACTION = 0.4
+# Fraction of the points if the answer form names ekf2-noise instead of r-scale: both make R wrong
+SAME_NUMBER_FRACTION = 2.0 / 3.0
+# Fraction of the points if the answer form names a consequence of the injected fault
+EFFECT_FRACTION = 0.15
+# Injected faults that can be guessed without a measurement: only the correct size has points. A
+# nearly correct size has no points, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
-# Tolerance of start and end of a mistake: the larger of a duration (s) and a fraction of the time
-TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION = 2.0, 0.05
-# Relative tolerances of a computed number for full points and for half of the points
-FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
-# Relative tolerance of the size of a mistake for half of the points
+# Tolerance (s) of start and end of an injected fault
+TIME_TOLERANCE_S = 2.0
+# Tolerance of a late start or end of an injected fault, as a fraction of the time since the first
+# data
+TIME_TOLERANCE_FRACTION = 0.05
+# Maximum relative error of a computed number with full points
+FULL_TOLERANCE = 0.02
+# Maximum relative error of a computed number with half of the points
+HALF_TOLERANCE = 0.10
+# Maximum relative error of the size of an injected fault with half of the points
 HALF_SIZE_TOLERANCE = 0.4
 
 
-@dataclass(frozen=True)
-class _CorrectionRule:
-    """Parameter that corrects mistakes, and its right values, from ``form_points.toml``.
+class _CorrectionRule(NamedTuple):
+    """Parameter that corrects injected faults, with the fraction of the points for each fault.
 
-    Attributes
-    ----------
-    fraction_by_mistake : mapping
-        Fraction of the points for this correction, by mistake.
-    right_values : (float, float) or str
-        Smallest and largest right value, or the name of a rule in :func:`right_corrections`.
-    only_if_late : bool
-        True if the correction is right for late timestamps only.
+    ``right_values``: smallest and largest right value, or the name of a rule in
+    :func:`right_corrections`.
     """
 
     parameter: str
     fraction_by_mistake: Mapping[str, float]
     right_values: tuple[float, float] | str = ANY_BOUNDS
-    only_if_late: bool = False
 
 
 POINTS_TABLE = table(__file__, "form_points.toml", dict)
@@ -76,9 +78,9 @@ class FormPoints:
     max_points_by_part : mapping
         Maximum points of each part of the form.
     feedback : tuple of str
-        Clauses for the student about right, missed and false mistakes.
+        Clauses for the student about right, missed and false faults.
     is_named_by_mistake : mapping
-        True for each mistake of the flight that the form names.
+        True for each injected fault of the flight that the form names.
     """
 
     points_by_part: Mapping[str, float]
@@ -110,8 +112,8 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if is_clean_named:
         points_by_part["mistakes"] = weights["mistakes"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        # no mistake of this flight has a size, so the part "mistakes" gets the points of "sizes"
-        # too
+        # no injected fault of this flight has a size, so the part "mistakes" gets the points of
+        # "sizes" too
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
@@ -121,14 +123,15 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
 
 
-# Mistake of the flight, best matching mistake in the answer form, and fraction of the points
+# Injected fault of the flight, best matching injected fault in the answer form, and fraction of the
+# points
 Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
     matches: list[Match], false_mistakes: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a clause for each right or missed mistake, and one for all false mistakes."""
+    """Yield a clause for each right or missed injected fault, and one for all false faults."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
@@ -145,9 +148,9 @@ def _mistake_feedback(
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake of the flight with one in the form; also return unmatched form mistakes.
+    """Match the injected faults of the flight with those in the form; also return unmatched ones.
 
-    Equal mistakes are matched first, then related mistakes, then consequences.
+    Equal injected faults are matched first, then related injected faults, then consequences.
     """
     unmatched = [
         student_mistake
@@ -173,7 +176,7 @@ def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], li
 
 
 def fraction_for_named_kind(kind: str, named_kind: str) -> float:
-    """Return the fraction of the points if a form names ``named_kind``, the flight has ``kind``."""
+    """Return the fraction of the points for naming ``named_kind`` instead of the fault ``kind``."""
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
@@ -184,7 +187,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points for four parts of the form, as mean over all mistakes."""
+    """Return the fraction of the points for four parts of the form: means over all faults."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:
@@ -203,9 +206,9 @@ def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, floa
 
 
 def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
-    """Return the fraction of the points for the size of a mistake: 1, 1/2 (close), 1/3, or 0.
+    """Return the fraction of the points for the size of a fault: 1, 1/2 (close), 1/3, or 0.
 
-    1/3 is for the wrong sign, and for the size of a related mistake.
+    1/3 is for the wrong sign, and for the size of a related injected fault.
     """
     size = student_mistake.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
@@ -220,7 +223,7 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
 
 
 def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
-    """Return the fraction of the points for time and report panel of a mistake: half for each."""
+    """Return the fraction of the points for time and report panel of a fault: half for each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = student_mistake.when == "whole flight"
     else:
@@ -235,7 +238,7 @@ def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistak
 
 
 def panels(kind: str) -> list[str]:
-    """Return the panels of the report that show a kind of mistake."""
+    """Return the panels of the report that show a kind of injected fault."""
     return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
 
 
@@ -261,19 +264,19 @@ def _value_fraction(value: float, low: float, high: float, fallback: float) -> f
     return 1.0 / 3.0 if low <= -value <= high else fallback
 
 
-# Parameter that corrects a mistake, bounds of its right values, and fraction of the points
+# Parameter that corrects an injected fault, bounds of its right values, and fraction of the points
 RightCorrection = tuple[str, tuple[float, float], float]
 
 
 def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorrection, ...]:
-    """Return the parameters that correct a mistake, with bounds of their right values."""
+    """Return the parameters that correct an injected fault, with bounds of their right values."""
     size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
     from_s = mistake.from_s or 0.0
     until_s = from_s if mistake.until_s is None else mistake.until_s
     bounds = {
         "negated": (-high, -low),
         "size": (low, high),
-        "milliseconds": (1e3 * low, 1e3 * high),
+        "late milliseconds": (1e3 * low, 1e3 * high),
         "twice": (2.0 * size, 1e4),
         "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
         "noise": (0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m),
@@ -284,10 +287,12 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
         (
             rule.parameter,
             bounds[values] if isinstance(values := rule.right_values, str) else values,
-            0.0 if rule.only_if_late and size <= 0.0 else rule.fraction_by_mistake[mistake.kind],
+            rule.fraction_by_mistake[mistake.kind],
         )
         for rule in CORRECTIONS
         if mistake.kind in rule.fraction_by_mistake
+        # EKF2_EV_DELAY cannot be negative
+        and (size > 0.0 or rule.right_values != "late milliseconds")
     )
 
 

@@ -112,7 +112,7 @@ class GradedReport:
     notes : str
         Text of the student.
     mistakes : mapping
-        True for each mistake of the assigned flight that the answer form names.
+        True for each injected fault of the assigned flight that the answer form names.
     redrawn_path : str
         Path of the PDF that px4fuse drew again from the log, relative to the class page.
     """

@@ -30,7 +30,7 @@ from px4fuse.core.reading import read_text
 from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import Answers
-from px4fuse.results.contract import ReportedResults
+from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import cannot_verify, log_sha256
 
@@ -145,7 +145,7 @@ def score_report(
     """
     check_input = CheckInput(results, verdict, key, submitter_id)
     points_rule, rule_text = _points_rule(check_input, rubric)
-    student, command = results.student, "compare" if check_input.comparison else "loop"
+    student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
     graded_items = []
     for item in rubric.items:
         if not item.applies(command, key):
@@ -183,7 +183,7 @@ def score_report(
 
 
 def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
-    """Return the rule for the points, and the reason; for "pending" the instructor's action."""
+    """Return the rule for the points of a report, and the reason or the instructor's action."""
     verdict = check_input.verdict
     reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
