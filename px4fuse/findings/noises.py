@@ -344,18 +344,21 @@ def _variance_finding(
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    """Format the action if EKF2's GNSS noise exceeds the σ that the receiver reports."""
+    """Format the action if EKF2's GNSS noise exceeds the receiver's σ and the estimated noise."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
     reported_m = float(np.sqrt(reported_variance.median()))
-    if not parameter_m > NOISE_RATIO_TOLERANCE * reported_m:  # false for NaN too
+    tuned = first_axis_tuning(analysis.tuning, HORIZONTAL)
+    noise_m = max(reported_m, (tuned.sigma_z.value if tuned else None) or 0.0)
+    if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # false for NaN too
         return ""
+    source = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
     return (
-        f"{name} is {parameter_m:g} m, but the receiver reports {reported_m:.2g} m: test this "
-        "value with px4fuse whatif."
+        f"{name} is {parameter_m:g} m, but {source} {noise_m:.2g} m: test this value with px4fuse "
+        "whatif."
     )
 
 
