@@ -470,7 +470,7 @@ def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame
     variance_after = run.variance[rows + 1, configuration_index]
     fused_at_s = run.segment.time_s[events.end_step[rows], None]
     settings = run.configurations[configuration_index].settings
-    # a clipped innovation is at the gate limit, apart from rounding, and was fused
+    # a clipped innovation was fused: it is at the gate limit, except for rounding
     limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
     velocity_rejected = (nu[:, :3] ** 2 > limit * S[:, :3]).any(axis=1, keepdims=True)
     # position along north and east (m), then velocity along north, east and down (m/s)
