@@ -294,6 +294,8 @@ def test_ekf2_position_corrections_by_fusion_exclude_resets():
     ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count after half of the target
     ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a logged end restarts the count
     ([10] * 3, [], [1, 2, 3]),
+    # 2 of 12 samples are not logged, but EKF2 counted them
+    ([4, 4, 8, 4, 4, 4, 4, 8, 4, 4], [], [2, 3, 5, 7, 8, 10]),
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
