@@ -48,6 +48,10 @@ HEADING_LOGGED_NOTE = (
     "magnetometer samples"
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
+HEIGHT_START_NOTE = (
+    ". It starts with the height that EKF2 estimated with the logged parameters while it declared "
+    "its acceleration bad, so the height may be wrong at first"
+)
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
@@ -298,10 +302,11 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
             "Heading is replayed with the magnetometer (as flown it differs from the log by "
             f"{difference_deg:.1f}° RMS)"
         )
-    return (
-        heading,
-        HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE,
-    )
+    height = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
+    is_bad = model.inputs.segments[0].is_acceleration_bad
+    if height == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
+        height += HEIGHT_START_NOTE
+    return heading, height
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:
@@ -605,16 +610,6 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         yield (
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise:g} m)"
-        )
-    segment = model.inputs.segments[0]
-    if (
-        segment.heights
-        and segment.is_acceleration_bad is not None
-        and segment.is_acceleration_bad[0]
-    ):
-        yield (
-            "The replay starts with the height that EKF2 estimated with the logged parameters, "
-            "while it declared its acceleration bad: the height may differ at the start"
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.uses_delay_as_horizon else ": raise EKF2_DELAY_MAX"
