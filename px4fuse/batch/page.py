@@ -211,7 +211,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the page filters with their options and log counts, most frequent option first."""
+    """Return each page filter with its options and their log counts, most frequent first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()

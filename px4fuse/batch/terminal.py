@@ -55,8 +55,10 @@ def format_summary(batch_result: BatchResult) -> Page:
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
-    reused_text = f"{batch_result.reused_count} reused from an earlier run"
-    page.write(f"{len(logs)} logs: {status_counts}; {reused_text}.{retry_note}")
+    page.write(
+        f"{len(logs)} logs: {status_counts}; from an earlier run: {batch_result.reused_count}."
+        f"{retry_note}"
+    )
     return page
 
 

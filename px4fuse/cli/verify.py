@@ -49,7 +49,7 @@ def verify(
     from px4fuse.verification.verification import verify as verify_report
 
     content = read_bytes_limited(
-        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report, which has less than 2 MB"
+        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report (PDF) of px4fuse"
     )
     recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
