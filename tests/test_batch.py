@@ -264,7 +264,7 @@ def test_batch_stopped_by_ctrl_c_keeps_finished_results(flights, undisturbed, tm
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
         _, said = process.communicate()
     assert process.returncode == 130
-    assert said.startswith("px4fuse: interrupted; finished results are in")
+    assert said.startswith("px4fuse: interrupted; results of finished logs are in")
     assert said.count("\n") == 1
     again = run_checked("batch", flights, "-o", tmp_path).output
     assert "3 logs: 3 done" in again

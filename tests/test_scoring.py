@@ -104,7 +104,7 @@ CHECKED = [
      {"setting": "sigma_z_m"}, 1.0, "within"),
     ("tuning", changed_results(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0,
      "too few of them"),
-    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "omit --axis"),
+    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "without --axis"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
@@ -116,18 +116,18 @@ CHECKED = [
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
     ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
-     "omit --axis"),
+     "without --axis"),
     ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
     ("consistent", EXAMPLE, {}, 1.0, "KF is consistent."),
     ("consistent", OVERSTATED, {}, 0.5, "σ of KF is 1.41 times too large"),
     ("consistent", OVERSTATED, {"factor": 1.25}, 0.0, "σ of KF is 1.41 times too large"),
     ("consistent", changed_results(horizontal__kf__verdict="overconfident",
      horizontal__kf__nis_mean=2.0), {}, 0.5, "1.41 times too small"),
-    ("consistent", NORTH, {}, 0.0, "omit --axis"),
+    ("consistent", NORTH, {}, 0.0, "without --axis"),
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "settings do not make KF consistent"),
-    ("clock", EXAMPLE, {}, 1.0, "the estimate is -0.022 to 0.061 s (95 %)"),
+    ("clock", EXAMPLE, {}, 1.0, "interval of the estimate is -0.022 to 0.061 s"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
@@ -193,7 +193,7 @@ class TestForm:
         ("form", "said"),
         [
             ({}, "report contains no answer form"),
-            ({"log_sha256": "c" * 64}, "was made for another log"),
+            ({"log_sha256": "c" * 64}, "are about different logs"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
         ],
@@ -215,7 +215,7 @@ class TestForm:
     def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, submitter_id, points):
         mistyped = with_form(["dropout"], student__id="s02")
         items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
-        assert [item.points for item in items if "Mistakes" in item.title] == [points]
+        assert [item.points for item in items if "faults" in item.title] == [points]
 
     def test_points_for_student_notes_are_pending_until_graded(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
@@ -253,7 +253,7 @@ class TestScore:
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
-            f"given to student s01, but the {said}"
+            f"assigned to student s01, but the {said}"
             in assess_results(given, key=key()).instructor_action
         )
         for rule, earns in (("zero", False), ("count", True)):

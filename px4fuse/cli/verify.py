@@ -103,7 +103,7 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verdict.redrawn:
-        page.write("The report of -o was not written, because the analysis was not repeated.")
+        page.write("No report was written with -o, because the analysis was not repeated.")
     elif output is None and verdict.pages:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."
