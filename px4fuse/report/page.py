@@ -144,7 +144,7 @@ class Page:
         is_compact : bool
             Small title and gaps, for the cover.
         """
-        # imported here because matplotlib takes 0.3 s, which text-only commands save
+        # imported here, because text-only commands do not need matplotlib (0.3 s)
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
@@ -229,7 +229,7 @@ def text_width(text: str) -> float:
     from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
-    # measured at a large size, because widths at a small one are rounded to whole points
+    # measured at a large font size, because widths are rounded to whole points
     font.set_size(100.0, 72.0)
     font.set_text(text, 0.0)
     return float(font.get_width_height()[0]) / 64.0 * 0.08

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Maximum p value of the Ljung-Box test for a note that innovations are not white: with eight tests
 # per flight, less than 1 % of flights have a false alarm
 MIN_WHITE_P = 0.001
-# Words for each verdict: "the reported σ is ..."
+# Size of the reported σ for each verdict
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
 RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -147,7 +147,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     notes = []
     if comparison.source.origin.may_drift:
         notes.append(
-            "The source may drift. The verdicts compare each filter with the source, "
+            "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
     correlated = [
@@ -213,8 +213,8 @@ def tuning_advice(
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
-            "The source may drift. These noises describe its short-term noise, not its "
-            "error. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
+            "The position source may drift. The estimates describe the noise without the "
+            "drift. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
             "ground truth or a loop."
         )
     options = [
@@ -253,7 +253,7 @@ def tuning_advice(
         bound = "" if tuning.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
             f"Accelerometer noise alone is {bound}{accelerometer_noise:.2g} m/s². KF has no state "
-            "for accelerometer bias and tilt error. To cover them SIGMA_A must be "
+            "for accelerometer bias and tilt error. To include both, SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
     if len(tuning.outlier_time_s):
