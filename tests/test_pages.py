@@ -588,11 +588,11 @@ def empty_first_page(writer: PdfWriter) -> None:
 
 FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a version appended": (lambda pdf: append_update(pdf, empty_first_page), "drawing operation"),
-    "a table behind the end": (shadowed, "the file has bytes after its end"),
-    "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "the file has bytes after its end"),
+    "a table behind the end": (shadowed, "the file has bytes after the end of the PDF"),
+    "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
     "a table at the beginning": (linearised, "the file has a second table of objects"),
     "a hybrid table": (hybrid, "the file has a second table of objects"),
-    "a later generation": (later_generation, "the PDF entry /Contents is an object of a later"),
+    "a later generation": (later_generation, "/Contents refers to an object of a later"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
     ),

@@ -16,7 +16,7 @@ from msgspec.structs import fields, replace
 from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
 
-# Maximum absolute length (m), and ratio of two quantities, in results of a flight
+# Maximum absolute value of a length (m), and of a ratio, in the results of a flight
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
 # Minimum and maximum of a number by pattern of its field name; the first match applies
 BOUNDS = {
@@ -134,7 +134,7 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # an error in a tuple of numbers (a vector) is raised, so that the whole vector is omitted
+    # one number outside its bounds omits the whole tuple of numbers (a vector)
     checked = []
     for element in value:
         try:
