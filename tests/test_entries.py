@@ -314,10 +314,10 @@ def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc' are not a number of 0 or more"),
-        ("1,A,-1,", "not a number of 0 or more"),
-        ("1,A,nan,", "not a number of 0 or more"),
-        ("1,A,1_5,", "not a number of 0 or more"),
+        ("1,A,abc,", "row 2: points 'abc' must be a number of 0 or more"),
+        ("1,A,-1,", "must be a number of 0 or more"),
+        ("1,A,nan,", "must be a number of 0 or more"),
+        ("1,A,1_5,", "must be a number of 0 or more"),
         ("1,,5,", "for an item or total"),
         ("1,A,5,\n1,A,6,", "student 1 has another row for item A"),
     ],

@@ -140,7 +140,7 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
     try:
         file_system, path = url_to_fs(address)
     except ImportError as error:  # __cause__ is the error that names the missing package
-        package = getattr(error.__cause__, "name", None) or "the package of this type of URL"
+        package = getattr(error.__cause__, "name", None) or "fsspec[full]"
         raise SettingsError(
             f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
         ) from error

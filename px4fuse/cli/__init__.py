@@ -60,7 +60,7 @@ PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
-    """Group that imports a command only when it is called."""
+    """Group of click that imports a command only when the command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)

@@ -56,7 +56,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def _scenario_options(command: Command) -> Command:
-    """Add an option for each number of a scenario; the field defines default and help."""
+    """Add an option for each number of a scenario, with default and help of the field."""
     for field, quantity in reversed(quantities(Scenario).items()):
         if not quantity.meaning:
             continue

@@ -180,7 +180,7 @@ def page(
         Sentence for readers without scripts: the file with all rows.
     ratio_axis : mapping, optional
         Scale of the plots in columns of ratios: ``ends``, ``bands`` and ``marks`` (SVG paths).
-        Keys are the second word of the style class of a cell.
+        The second word of the style class of a cell is a key of ``bands`` and ``marks``.
 
     Returns
     -------

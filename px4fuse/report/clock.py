@@ -45,7 +45,7 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """Return the time offset of the position source, and the actions against it, by label."""
+    """Return sentences on the time offset of the position source and its correction, by label."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:

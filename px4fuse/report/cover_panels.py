@@ -371,7 +371,7 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> tuple[Array,
     """Return the lower left and the upper right corner of the map (m).
 
     The map shows all ground truth and 98 % of the positions, and the other tracks up to
-    :data:`MAP_REACH` outside of these, so a filter with a large error does not shrink the flight.
+    :data:`MAP_REACH` outside of these, so a large error of a filter does not reduce the scale.
     """
     middles, sizes = [], []
     for side in (0, 1):

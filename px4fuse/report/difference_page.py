@@ -37,7 +37,7 @@ INCREASE_STYLE = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if they are unknown."""
+    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if none is known."""
     explanations = _axis_explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()

@@ -208,13 +208,13 @@ class Page:
         )
 
     def add_columns(self, *columns: Page, above: float = 6.0) -> None:
-        """Add columns side by side, with a space `above` them in points."""
+        """Add columns side by side, below a gap of `above` points."""
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
 
 
 def halves(left_fraction: float = 0.5) -> tuple[Page, Page]:
-    """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
+    """Return two columns that fill the page; the left one has `left_fraction` of the width."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 

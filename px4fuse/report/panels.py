@@ -77,9 +77,9 @@ class Panel(NamedTuple):
         with_time_label : bool
             Label the time axis, which all panels above share.
         with_mode_names : bool
-            Write the names of the flight modes above it.
+            Write the names of the flight modes above the plot.
         is_narrow : bool
-            Draw it in a narrow column: without caption, and with the numbers below it.
+            Draw the plot in a narrow column: without caption, with the numbers below the plot.
         """
         title, caption, height, numbers = self.title, "", NARROW_HEIGHT, self.numbers(result)
         if not is_narrow:

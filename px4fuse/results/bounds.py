@@ -1,4 +1,4 @@
-"""Bounds of the numbers in results: a number outside its bounds is replaced by the reason.
+"""Bounds of the numbers in results: a number outside its bounds is replaced by a reason.
 
 The bounds depend on the name of a field, which contains quantity and unit.
 """
@@ -45,7 +45,7 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their bounds from results; without such numbers, return the argument.
+    """Remove numbers outside their bounds from results; results without them are not changed.
 
     An optional number is omitted. If a required number is outside its bounds, its record is omitted
     or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes`` of the results.

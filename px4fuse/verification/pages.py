@@ -75,15 +75,15 @@ MAX_XMP_BYTES = 100_000
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
-    "/AA": "an action",
+    "/AA": "an automatic action",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
     "/CropBox": "a crop box",
     "/OCProperties": "layers",
-    "/OpenAction": "an action",
+    "/OpenAction": "an automatic action",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "another unit of length",
+    "/UserUnit": "a unit of length",
     "/XObject": "a picture or form",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others

@@ -388,16 +388,20 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         side = "small" if nis_result.nis_mean > 1.0 else "large"
-        factor_text = format_factor(nis_result.sigma_error_factor)
-        statement = f"The reported σ of KF is {factor_text} times too {side}"
+        factor = nis_result.sigma_error_factor
+        fraction = fraction_for_deviation(factor, self.factor)
+        advice = (
+            "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
+            "errors that are not white noise."
+        )
         if all(_score_tuning(check_input, name)[0] == 1.0 for name in NOISE_SETTINGS):
-            return 1.0, (
-                f"{statement}. SIGMA_A and SIGMA_Z are within their 95 % intervals, so other "
-                "settings do not make KF consistent."
+            fraction = 1.0
+            advice = (
+                "SIGMA_A and SIGMA_Z are within their 95 % intervals, so other settings do not "
+                "make KF consistent."
             )
-        return fraction_for_deviation(nis_result.sigma_error_factor, self.factor), (
-            f"{statement}. Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and "
-            "look for errors that are not white noise."
+        return fraction, (
+            f"The reported σ of KF is {format_factor(factor)} times too {side}. {advice}"
         )
 
 
@@ -479,11 +483,11 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
             return 0.0, reason
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
-        statement = f"You measured a loop closure error of {error_text} after {path_text}"
-        if not is_accepted:
-            return 0.25, f"{statement}. No loop closure was accepted."
-        quarter_count, comment = _score_corrections(loop.corrections)
-        return (2.0 + quarter_count) / 4.0, f"{statement}. The loop closure was accepted. {comment}"
+        quarter_count, comment = _score_corrections(loop.corrections) if is_accepted else (-1.0, "")
+        return (2.0 + quarter_count) / 4.0, (
+            f"You measured a loop closure error of {error_text} after {path_text}. "
+            f"{'A' if is_accepted else 'No'} loop closure was accepted. {comment}"
+        ).rstrip()
 
 
 def _score_corrections(
@@ -511,10 +515,11 @@ def _score_corrections(
             "The path was corrected. The report contains no ATE: add a trajectory with --reference."
         )
     before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
-    statement = f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m"
-    if after_m < before_m:
-        return 2.0, f"{statement}."
-    return 1.0, f"{statement}. Explain why the correction increases the error."
+    is_better = after_m < before_m
+    advice = "" if is_better else " Explain why the correction increases the error."
+    return 1.0 + is_better, (
+        f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m.{advice}"
+    )
 
 
 def _ate_by_reference(correction: object) -> dict[str, float]:

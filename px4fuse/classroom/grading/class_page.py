@@ -78,7 +78,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
-        full_table_note="All rows are in class.csv.",
+        full_table_note="The table class.csv contains all rows.",
     )
 
 

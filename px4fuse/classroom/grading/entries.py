@@ -234,7 +234,7 @@ def _make_attempt(
     )
     late_s, flags = None, []
     if due_time is not None and time is not None:
-        # UNIX times are subtracted, because datetime ignores daylight saving in one time zone
+        # UNIX times, because differences of datetimes ignore daylight saving within a time zone
         late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
     elif origin.is_late:
         flags.append(
@@ -387,7 +387,7 @@ def read_overrides(path: Path) -> Overrides:
             problem = f"student {one_line(student, 40)} has another row for item {item_text}"
         elif points and (value is None or value < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r} are not a number of 0 or more for an item or total"
+            problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))

@@ -62,7 +62,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
         )
     without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
-        yield "The IMU was not used (--input zero)."
+        yield "KF did not use the IMU (--input zero)."
     source = results.source
     tracks_as_received = [track.name for track in source.available if track.path == "as received"]
     if tracks_as_received and source.path != "as received":
@@ -140,7 +140,7 @@ COMMON_CHECKS: tuple[
         _student_key,
     ),
     (
-        "The report has the numbers of {}, but another log: the log is a changed copy.",
+        "The report has the numbers of {}, but another SHA-256 of the log: it is a copy.",
         lambda report: (
             report.verdict.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS

@@ -187,7 +187,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points for four parts of the form: means over all faults."""
+    """Return the fraction of the points for four parts of the form, as means over all faults."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:

@@ -339,7 +339,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         columns = matches
     if len(columns) == 1:
         return columns[0]
-    problem = "the table has several grade columns" if columns else "no grade column matches"
+    problem = "the table has several grade columns" if columns else "no grade column was found"
     titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
     remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
