@@ -16,9 +16,7 @@ from px4fuse.results.contract import ChangeResults, Interval
 if TYPE_CHECKING:
     from px4fuse.batch.run import BatchResult
 
-# Maximum number of reasons for missing results that the summary lists
 MAX_LISTED_REASONS = 8
-# Maximum number of logs that the summary lists
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]

@@ -307,7 +307,7 @@ def rerun_start(reruns: Sequence[Rerun]) -> str:
         return ""
     return (
         "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values are from the time "
-        f"after {min(starts):.0f} s, without gaps."
+        f"after {min(starts):.0f} s without gaps."
     )
 
 

@@ -187,7 +187,7 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
 def _time_sentence(explanation: DifferenceExplanation) -> str:
     largest_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
-        f"Largest difference KF - EKF2 {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
+        f"Largest difference KF - EKF2: {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
         f"{explanation.times_s[largest_row]:.1f} s; unexplained RMS "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

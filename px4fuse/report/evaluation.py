@@ -26,7 +26,7 @@ MAP_AXES: Mapping[Frame, tuple[int, int]] = {
 }
 # Minimum interval between two poses that is drawn as a gap, relative to the median interval
 MIN_GAP_STEPS = 10.0
-MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
+MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
@@ -293,7 +293,7 @@ def quarters_sentence(evaluation: Evaluation) -> str:
 
 def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     """Return the caption of the RPE plot: growth of the RPE with the distance or time."""
-    interval_note = "The plot shows the RMSE with its 95 % interval."
+    interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
         for error in rpe

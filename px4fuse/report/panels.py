@@ -245,9 +245,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
         table = innovation_tables[name]
         assert isinstance(table, pd.DataFrame)  # filters with a verdict have innovations
         outside_count = int((table["innovation_m"].abs() > half_height).sum())
-        outside = (
-            f", {outside_count} innovations outside the plot (triangles)" if outside_count else ""
-        )
+        outside = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "

@@ -207,8 +207,8 @@ def tuning_advice(
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
-    name = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
-    tuning = tuning_by_axis.get(name)
+    axis = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
+    tuning = tuning_by_axis.get(axis)
     if not isinstance(tuning, AxisTuning):
         return {}
     advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
@@ -226,7 +226,7 @@ def tuning_advice(
     ]
     if options:
         command = f"px4fuse compare LOG{''.join(options)}"
-        advice["Action"] = f"Re-run with the estimates of {name}: {command}"
+        advice["Action"] = f"Re-run with the estimates of {axis}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m. Check that the source measures positions."
@@ -263,7 +263,7 @@ def tuning_advice(
         )
     if len(tuning.outlier_time_s):
         advice["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({name}) are outliers, "
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis}) are outliers, "
             f"the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude them."
         )
     return advice
