@@ -14,7 +14,7 @@ FONT = "DejaVu Sans"
 # Words in the names of fonts that draw a box for every character
 BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MAX_LISTED_CHARACTERS = 12  # maximum number of missing characters in the advice
+MAX_LISTED_CHARACTERS = 12
 
 
 @cache

@@ -30,7 +30,7 @@ LEAD = (
     "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
     "tested first, because a false closure would deform the whole path."
 )
-MAX_LISTED_CLOSURES = 10  # maximum number of rejected loop closures that the terminal lists
+MAX_LISTED_CLOSURES = 10
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
     corrections.UNCORRECTED: LINES["EKF2"],

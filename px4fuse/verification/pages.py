@@ -216,7 +216,7 @@ class _PdfComparison:
             submitted_value, redrawn_value, key = remaining_values.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
-                raise LimitReachedError("the PDF contains too many values to compare")
+                raise LimitReachedError("the PDF contains too many values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:  # some programs ignore generation numbers
                     yield PageDifference(

@@ -266,8 +266,7 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
         objects = map(resolve_reference, contents)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
     if features:
-        features_text = ", ".join(sorted(features))
-        raise ResultsError(f"the PDF contains {features_text}, which reports do not contain.")
+        raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike all reports.")
     if not files and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "

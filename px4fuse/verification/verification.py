@@ -281,7 +281,7 @@ def _verify_with_log(
 ) -> Verdict:
     redrawn_pdf = draw()
     if redrawn_pdf == pdf:
-        reason = "a new run of the analysis on the log gives an identical PDF"
+        reason = "a new run on the log gives an identical PDF"
         return Verdict(
             "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
         )

@@ -27,7 +27,6 @@ SAME_NUMBER_TOLERANCE = 0.02
 MIN_SEGMENT_FRACTION = 0.5
 # Maximum factor between --drift or --heading-drift and its default; otherwise a flag is raised
 MAX_DRIFT_FACTOR = 4.0
-# Maximum number of reports with equal contents that a flag lists
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents, for example the same answer form
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
