@@ -255,7 +255,7 @@ def verify(
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
-        reason = f"none of the {len(logs)} given files is the log (SHA-256 {expected_hash})"
+        reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {name} to --logs."
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
