@@ -38,8 +38,8 @@ TURN_ROUND_S = 4.0
 MIN_RAMP_DISTANCE_S = 1e-9
 # Range of the periods (s) of the sines whose sum is the slow deviation from the path
 DEVIATION_PERIODS_S = (3.0, 20.0)
-# Number of sines in the slow deviation from the path
-DEVIATION_SINE_COUNT = 4
+# Number of sines in a slow deviation or sensor error
+SINE_COUNT = 4
 
 
 def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
@@ -81,14 +81,12 @@ class Sines:
     cosine: Array
 
     @classmethod
-    def draw(
-        cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float], count: int
-    ) -> Sines:
-        """Draw ``count`` sines with log-uniform periods, random phases, and an RMS per axis."""
+    def draw(cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float]) -> Sines:
+        """Draw SINE_COUNT sines with log-uniform periods, random phases, and an RMS per axis."""
         low, high = np.log(periods_s)
-        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, count))
-        phase = rng.uniform(0.0, 2.0 * np.pi, (count, len(rms)))
-        amplitude = rms * np.sqrt(2.0 / count)
+        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, SINE_COUNT))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (SINE_COUNT, len(rms)))
+        amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def at(self, time_s: Array, orders: int = 1) -> list[Array]:
@@ -246,9 +244,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     return Motion(
         velocity=_ramps(flight_plan.path),
         yaw=_ramps(flight_plan.yaw),
-        deviation=Sines.draw(
-            rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT
-        ),
+        deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S),
         take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
         duration_s=float(np.ceil(touch_down_s + TIME_ON_GROUND_S)),

@@ -56,8 +56,6 @@ HEIGHT_ERROR_M = 0.03
 HEADING_TIME_CONSTANT_S = 3.0
 # Range of the periods (s) of the sines that are the slow attitude and height errors
 SLOW_ERROR_PERIODS_S = (20.0, 60.0)
-# Number of sines in a slow attitude or height error
-SLOW_ERROR_SINE_COUNT = 4
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
 # Publication interval (µs) of vehicle_land_detected
@@ -183,7 +181,7 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
 def height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow height error (m, positive downward)."""
     rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
-    return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT).at(time_s)[0][:, 0]
+    return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
 def limit_rate(full_topic: Topic, rate_hz: float) -> Topic:
@@ -258,8 +256,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
-    sines = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT)
-    error = sines.at(time_s)[0]
+    error = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
         size = np.radians(mistakes.heading_deg)
         if mistakes.heading_at_s is not None:
