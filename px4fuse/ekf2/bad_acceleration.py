@@ -59,8 +59,8 @@ class BadAcceleration:
     def share(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set; None if it is not set.
 
-        Call this method for successive intervals: a flag that follows the log gets the logged value at
-        the end of the interval.
+        Call this method for successive intervals: a flag that follows the log gets the logged value
+        at the end of the interval.
         """
         if len(self.logged_since_s):
             row = np.searchsorted(self.logged_since_s, end_s) - 1
