@@ -356,8 +356,8 @@ def _check_gate(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-# Vision checks in the order of EKF2, after the switch: a switch that is off may be the user's
-# intention
+# Vision checks in the order of EKF2, after the switch: the user may have disabled fusion
+# intentionally
 VISION_CONDITIONS = (
     _check_switch,
     _check_frame,

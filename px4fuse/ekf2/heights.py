@@ -65,7 +65,7 @@ def add_heights(
     fused_aids = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
     for aid in HEIGHT_AIDS:
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
-            return f"EKF2 also fused {aid.label} for a time in flight"
+            return f"EKF2 also fused {aid.label} in part of the flight"
     reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
     # a single height sensor is the reference
     if len(fused_aids) == 1:
