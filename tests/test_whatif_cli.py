@@ -79,7 +79,10 @@ def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path)
 def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
     model = open_model(estimated.flight)
     for without, said in (
-        ({"baro_hgt": 60.0}, "baro_hgt: in this log the replay fuses only ev_pos."),
+        (
+            {"baro_hgt": 60.0},
+            "baro_hgt cannot be omitted: the replay of this log fuses only ev_pos.",
+        ),
         ({"ev_pos": 500.0}, "500 s leaves less than 5 s of the replayed flight"),
     ):
         with pytest.raises(SettingsError, match=said):
