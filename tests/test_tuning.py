@@ -11,7 +11,6 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
-from px4fuse.cli.tune import format_noise_estimate
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -27,6 +26,7 @@ from px4fuse.filter.tuning import (
     tune_axes,
 )
 from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.report.phrases import format_noise_estimate
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 

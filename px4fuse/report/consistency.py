@@ -14,12 +14,19 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary, Unt
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
 from px4fuse.report.panels import normalised_innovations
-from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
+from px4fuse.report.phrases import (
+    VERDICT_HEAD,
+    filters_by_name,
+    format_noise_estimate,
+    format_settings,
+    verdict_rows,
+)
 from px4fuse.report.style import (
     DOTS,
     KF_COLOUR,
@@ -47,7 +54,7 @@ CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nees": ("√NEES", 0.5),
     "difference": ("KF - EKF2 (m)", 1.0),
 }
-
+NOISE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
 
 Series = Mapping[str, "pd.Series[float]"]
 
@@ -103,6 +110,15 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         verdict_rows(analysis.axes.values(), _statistic_cells),
         right_aligned_columns=(2, 5, 6, 7, 8),
     )
+    noise_rows = [
+        [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
+        for name, tuning in analysis.tuning.items()
+        if isinstance(tuning, AxisTuning)
+    ]
+    if noise_rows:
+        page.heading("Maximum-likelihood noises of KF, with 95 % intervals")
+        page.table(NOISE_HEAD, noise_rows, right_aligned_columns=(1, 2))
+        page.write(f"This report uses {format_settings(analysis.settings)}.")
     _write_causes(page, analysis)
     yield page
 

@@ -15,7 +15,7 @@ from px4fuse.comparison.model import (
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.log import ClockMap
 from px4fuse.flight.model import Alignment, Truth, Unavailable
@@ -293,3 +293,14 @@ def write_finding(page: Page, group: list[Finding]) -> None:
         above=2.0,
         colour=SEVERITY_COLOURS[finding.severity],
     )
+
+
+def format_noise_estimate(noise: Noise) -> str:
+    """Format a maximum-likelihood noise and its 95 % interval, without the unit."""
+    if noise.value is None:
+        bounds = (("at most", noise.high), ("at least", noise.low))
+        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
+        return next(texts, "not identifiable")
+    low = "0" if noise.low is None else f"{noise.low:.2g}"
+    high = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low}-{high})"
