@@ -350,7 +350,9 @@ def test_error_beyond_sigma_finding_tests_rmse_after_alignment(
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
-    assert ("The frame is misaligned: horizontal position RMSE 1.00 m" in finding.message) is frame
+    assert (
+        "The position frame is misaligned: horizontal position RMSE 1.00 m" in finding.message
+    ) is frame
     assert (finding.id == "source_drift") is (drifts and not frame)
     if finding.id == "source_drift":
         assert finding.message.startswith(

@@ -316,12 +316,12 @@ def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 2.0}, "measurement noise",
          "Set SIGMA_A to 0.3 m/s² (--sigma-a 0.3) and SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"outliers_left_out": 9.0}, "outliers",
-         "Restore line of sight, or remove the outliers at the sender."),
+         "Restore line of sight, or remove the outliers before sending."),
         ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
          "at the sender. Set SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"clock_offset_s": -0.25}, "clock",
-         "Subtract 0.250 s from the timestamps at the sender."),
-        ("kf", {"clock_offset_s": 0.25}, "clock", "Add 0.250 s to the timestamps at the sender."),
+         "Subtract 0.250 s from the position timestamps before sending."),
+        ("kf", {"clock_offset_s": 0.25}, "clock", "Add 0.250 s to the position timestamps before sending."),
         ("kf", {"turned_deg": -20.0}, "frame",
          "Rotate the positions by -20° before they are sent."),
         ("kf", {"bias_forward_m_s2": 0.5, "bias_right_m_s2": 0.1}, "accelerometer",
@@ -410,7 +410,7 @@ def test_noise_of_overconfident_ekf2_is_advised_without_replay(
         (0.1, "uwb", 0.0,
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
         (0.5, "gnss", 0.44,
-         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
+         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what KF and EKF2 assume: EKF2 "
           "rejects 44 % of the positions")),
     ],
 )  # fmt: skip
@@ -508,7 +508,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
 @pytest.mark.parametrize(
     ("loop", "size"),
     [
-        (closing(1.42, 88.0, END), "loop closure error 1.42 m after 88 m (1.6 %)"),
+        (closing(1.42, 88.0, END), "loop closure error 1.42 m after a path of 88 m (1.6 %)"),
         # the landing place is only assumed, or the track does not drift
         (closing(1.42, 88.0, replace(END, assumed=True)), None),
         (closing(1.42, 88.0, END, is_absolute_track=True), None),

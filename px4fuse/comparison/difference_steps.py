@@ -239,7 +239,7 @@ def _step_reasons(
         f"{1e3 * inputs.step_s:.0f} ms"
     )
     if settings.input == "zero":
-        samples_text = "KF assumes zero acceleration (--input zero); EKF2 uses the IMU"
+        samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != inputs.received.source:
         samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
     age_ms = 1e3 * (source.age_s - settings.clock_offset_s)

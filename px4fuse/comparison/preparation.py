@@ -197,7 +197,7 @@ def _use_barometer_height(
     ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_name and not track.origin.fused_as_gnss:
         raise SettingsError(
-            f"{log_name}: `height` needs GNSS as the position source of KF, not {track.name}."
+            f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
     is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
     uses_barometer = height_name == "barometer" or (
