@@ -359,7 +359,8 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [
-    (0.5, ""), (1.0, ""), (1.1, "not removed"), (17.9, "not removed"), (18.0, "not removed"), (18.5, ""),
+    (0.5, ""), (1.0, ""), (1.1, "not removed"), (17.9, "not removed"), (18.0, "not removed"),
+    (18.5, ""),
 ])  # fmt: skip
 def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""

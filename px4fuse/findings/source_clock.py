@@ -16,9 +16,9 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 MIN_OFFSET_S = 0.03
 # Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10
-# Maximum ratio of KF's position RMSE after and before the correction of a real time offset
+# Maximum ratio of KF's position RMSE with the time offset corrected to that as flown, for a finding
 MAX_RMSE_RATIO = 1.005
-CORRECT_AT_SENDER = "Correct the timestamps at the sender."
+CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -31,7 +31,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     """Detect a time offset between positions and IMU, constant or changing."""
-    if find_low_pass(analysis) is not None:  # a low pass delays positions without a time offset
+    if find_low_pass(analysis) is not None:  # a low pass delays positions, not timestamps
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
@@ -41,9 +41,9 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
             f"{end_offset_s:+.2f} s (p {clock.change_p_value:.1g}). No single --clock-offset "
-            "corrects both. Until 500 TIMESYNC answers have come, PX4 uses arrival times.",
-            "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
-            "change (--start, --end).",
+            "corrects both. PX4 uses arrival times until it has received 500 TIMESYNC answers.",
+            "Let the clocks synchronise for one minute before take-off. Analyse only the time "
+            "before or after the change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},
         )
         return
@@ -74,7 +74,7 @@ def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | Non
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the position RMSE after a change over that before; NaN without ground truth."""
+    """Return the ratio of the position RMSE with a change to that as flown; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
@@ -96,7 +96,7 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action at the sender."""
+    """Return the action that corrects the timestamps."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
@@ -110,7 +110,7 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
     """Return the value (s) for ``--clock-offset``.
 
-    For a position file, the time offset that its alignment applied is added.
+    For a position file, this includes the time offset that its alignment already applied.
     """
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
