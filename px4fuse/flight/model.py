@@ -258,6 +258,12 @@ def source_name(source: PositionTrack) -> str:
     return SOURCE_NAMES[source.origin.kind]
 
 
+def reset_times_s(track: PositionTrack) -> Array:
+    """Return the times at which ``reset_counter`` of the source changes."""
+    counter = track.status.get("reset_counter", pd.Series(dtype=float))
+    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
+
+
 def positions_of(source: PositionTrack) -> str:
     """Return the noun phrase for the positions of a source: "UWB positions"."""
     if source.origin.kind == "file":
