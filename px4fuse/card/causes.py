@@ -27,11 +27,12 @@ from px4fuse.comparison.trials import (
     ratios,
     reduction,
 )
-from px4fuse.core.text import with_log_name
+from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -241,8 +242,8 @@ def _make_actions(
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
             offset.filter == "kf"
         )
-        verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
-        sender = Action("sender", f"{verb} the timestamp (usec) of each position")
+        add_or_subtract = lower_first(format_shift(shift))
+        sender = Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
         if analysis.source.origin.is_gnss and general_action is not None:
             sender = general_action  # a GNSS receiver does not let the user shift its timestamps
         if delay is not None:
@@ -394,9 +395,7 @@ def _closing_sentence(
             "parameter (ms) is the age of a position."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return (
-            "KF is consistent with the default and with the estimate. The default needs no option."
-        )
+        return "KF is consistent with the default and with the estimate."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):

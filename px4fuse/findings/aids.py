@@ -12,7 +12,7 @@ from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import capitalise_first, format_number, format_ratio
-from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
+from px4fuse.ekf2.aids import WINDOW_S, AidResult
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
@@ -85,9 +85,8 @@ def detect_in_aids(
             "note" if is_barometer and not effect else "warning",
             "aid_not_fused",
             f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} "
-            f"s{effect}. Fusion was enabled, and the limit is {NOT_FUSED_LIMIT_S:g} s. EKF2 "
-            f"rejected {format_percent(longest_unfused.rejected_fraction)} of the samples, and "
-            "relied on the IMU and other aiding sources.",
+            f"s{effect}. EKF2 rejected {format_percent(longest_unfused.rejected_fraction)} of the "
+            "samples, and relied on the IMU and other aiding sources.",
             CHECKS.get(switch, OTHER_CHECK),
             {
                 "aid": labels,

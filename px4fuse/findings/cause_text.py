@@ -95,16 +95,17 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
-        add_or_subtract = f"Add {offset_s:.3f} s to"
-        if offset_s < 0:
-            add_or_subtract = f"Subtract {-offset_s:.3f} s from"
-        actions.append(f"{add_or_subtract} the position timestamps before sending.")
+        actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
     if change:
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))
     return " ".join(actions)
+
+
+def format_shift(shift_s: float) -> str:
+    return f"Subtract {-shift_s:.3f} s from" if shift_s < 0 else f"Add {shift_s:.3f} s to"
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:

@@ -159,9 +159,9 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
         action = f"Use a faster SD card, or set SDLOG_PROFILE to {profile ^ other_topics}."
     yield warning(
         "imu_samples_missing",
-        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. The logger "
-        "lost single samples all over the flight. KF increases Q in these gaps. EKF2 cannot be "
-        "replayed, so the effect of changed parameters is unknown.",
+        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
+        "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
+        "is unknown.",
         action,
         {"lost_fraction": lost_fraction, "sdlog_profile": profile},
     )

@@ -33,8 +33,7 @@ def detect_dropouts(analysis: Comparison) -> Findings:
         yield warning(
             "logger_dropouts",
             f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
-            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s. All "
-            "topics are missing in these intervals.",
+            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -108,8 +107,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if MODEL_NOTE in log.notes:
         yield note(
             "ekf2_simulated",
-            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code. The model used the "
-            "simulated sensors.",
+            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code.",
             "Use a real flight to assess PX4's EKF2.",
         )
     if not isinstance(ekf2, Ekf2):
@@ -117,9 +115,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if log.autopilot != "PX4":
         yield note(
             "not_px4",
-            f"This log is from {log.autopilot}, not PX4. EKF2 in this report means the estimator "
-            f"of {log.autopilot}. {log.autopilot} does not have the PX4 parameters that the "
-            "report names.",
+            f"This log is from {log.autopilot}, not PX4. {log.autopilot} does not have the PX4 "
+            "parameters that the report names.",
             'Read "EKF2" in this report as the estimator of this autopilot.',
             {"autopilot": log.autopilot},
         )

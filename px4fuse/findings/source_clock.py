@@ -7,6 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
@@ -100,12 +101,10 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
     if analysis.source.alignment is not None:
         option_s = clock_offset_option_s(analysis, clock)
         return f"Run again with --clock-offset {option_s:.3f}."
-    size_s = abs(clock.remaining_s)
-    verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
     age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
     horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
     also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
-    return f"{verb} the timestamp (usec) of each position{also}."
+    return f"{format_shift(clock.remaining_s)} the timestamp (usec) of each position{also}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:

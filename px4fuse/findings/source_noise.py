@@ -115,7 +115,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         "source_samples_repeated",
         f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous "
         f"position. KF and EKF2 use each repetition ({format_percent(share)}) as a new, "
-        "independent measurement, although nothing was measured at that time.",
+        "independent measurement.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": share},
     )

@@ -100,7 +100,7 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
         f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
         "uses the receive time instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
-        "64-bit integer. A 32-bit float is not precise enough.",
+        "64-bit integer.",
         {"stamps": clock.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
