@@ -886,7 +886,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
     truth = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     for known, north_m, reference in (
         (truth, 3.0, "ground truth"),
-        (NONE, 2.0, "the positions around them"),
+        (NONE, 2.0, "the neighbouring positions"),
     ):
         axes = tuple(axis(name, truth=known) for name in ("north", "east"))
         axes[0].axis.measurement_m = np.ones(120)
@@ -905,7 +905,7 @@ def test_position_outlier_finding_states_number_ekf2_rejected() -> None:
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
     one = analysis(axes=(axis(ekf2_innovations=innovations),), tuning=outliers)
     finding = only(source_positions.detect_outliers, one)
-    assert finding.message.endswith("EKF2's gate rejected 2 of the 3.")
+    assert finding.message.endswith("EKF2's gate rejected 2 of the 3 outliers.")
     one.main.ekf2_innovations = innovations[::2]
     assert "gate rejected" not in only(source_positions.detect_outliers, one).message
 
@@ -989,13 +989,13 @@ def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Tr
             late(0.05, interval_s=(0.04, 0.07)),
             0.0,
             "EKF2_EV_DELAY cannot be negative",
-            "Correct the timestamps at the sender.",
+            "Correct the position timestamps before sending.",
         ),
         (
             late(-0.301, interval_s=(-0.4, -0.2)),
             0.0,
             "EKF2_EV_DELAY cannot exceed 300 ms",
-            "Correct the timestamps at the sender.",
+            "Correct the position timestamps before sending.",
         ),
         (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "300 ms late", "Check EKF2_EV_DELAY."),
     ],
@@ -1011,7 +1011,10 @@ def test_recommended_ekf2_delay_stays_in_px4_range(
 
 @pytest.mark.parametrize(
     ("after_m", "remedy"),
-    [(0.5, "Set EKF2_EV_DELAY to 120 ms."), (1.0, "Correct the timestamps at the sender.")],
+    [
+        (0.5, "Set EKF2_EV_DELAY to 120 ms."),
+        (1.0, "Correct the position timestamps before sending."),
+    ],
 )
 def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)

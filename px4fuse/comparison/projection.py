@@ -213,13 +213,13 @@ def project_innovations(
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
     common = north.index.intersection(east.index)
-    n, e = north.loc[common], east.loc[common]
-    c, s = float(direction[0]), float(direction[1])
-    projected = c * c * n + s * s * e  # correct for variances only
-    projected["innovation_m"] = c * n["innovation_m"] + s * e["innovation_m"]
+    north, east = north.loc[common], east.loc[common]
+    cosine, sine = float(direction[0]), float(direction[1])
+    projected = cosine * cosine * north + sine * sine * east  # right for variances only
+    projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together: take the larger value
-        projected[column] = np.fmax(n[column], e[column])
+        projected[column] = np.fmax(north[column], east[column])
     return projected
 
 
@@ -246,14 +246,14 @@ def observation_variance(
     if aid is None or math.isnan(noise_m):
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
-    r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
+    configured_m2 = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # EKF2 did not receive the variance in a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
-        return r
+        return configured_m2
     reported = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
-    reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
-    return max(r, reported_along)
+    reported_m2 = float(np.nansum(reported.to_numpy() * axis.direction**2))
+    return max(configured_m2, reported_m2)
 
 
 def project_truth(

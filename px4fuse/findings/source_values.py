@@ -81,14 +81,14 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
     """Detect rows that contain zeros, a repeated last position, or no position."""
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
-    for reason, (name, fault_of, action) in INVALID.items():
+    for reason, (name, fault_template, action) in INVALID.items():
         time_s = invalid[invalid == reason].index.to_numpy()
         if not (count := len(time_s)):
             continue
         spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
         longest_s = max(spans, key=lambda span: span[1] - span[0])
         duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
-        fault = fault_of.format(positions=f"{count} {positions_of(source)}")
+        fault = fault_template.format(positions=f"{count} {positions_of(source)}")
         times = f"{len(spans)} spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
