@@ -41,7 +41,8 @@ MIN_SETTING_RATIO = 4.0
 MIN_STEP_EFFECT_M = 1e-6
 # Minimum position difference KF - EKF2 (m) outside the replayed times for the report to state it
 MIN_UNREPLAYED_M = 0.5
-# Minimum ratio of the largest differences KF - EKF2 outside and inside the replayed times for this
+# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to that inside, for
+# the report to state it
 MIN_UNREPLAYED_RATIO = 3.0
 
 

@@ -15,7 +15,7 @@ from px4fuse.flight.model import Unavailable
 MIN_AXIS_NIS_RATIO = 1.7
 # Maximum number of time spans into which a flight is divided to find a noisy one
 MAX_PARTS = 12
-# Minimum number of measurements in each of these time spans
+# Minimum number of measurements in each time span into which a flight is divided
 MIN_PART_COUNT = 25
 
 

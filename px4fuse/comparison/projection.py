@@ -215,7 +215,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     common = north.index.intersection(east.index)
     north, east = north.loc[common], east.loc[common]
     cosine, sine = float(direction[0]), float(direction[1])
-    projected = cosine * cosine * north + sine * sine * east  # right for variances only
+    projected = cosine * cosine * north + sine * sine * east  # for variances; other columns follow
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together: take the larger value

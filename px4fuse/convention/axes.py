@@ -30,7 +30,7 @@ MAX_OFFSET_S = 10.0
 MIN_OVERLAP_S = 10.0
 # Minimum scale (m) of the horizontal residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_M = 0.05
-# Minimum scale (m) of the vertical residuals, for the same reasons
+# Minimum scale (m) of the vertical residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 FREEDOM = 4.0

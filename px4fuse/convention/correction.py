@@ -16,12 +16,12 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) of a frame with wrong axes to be corrected here; HeadingError covers smaller
-# ones
+# Minimum rotation (°) of a frame with wrong axes to be corrected here: HeadingError contains
+# smaller rotations
 MIN_REMAINDER_DEG = 8.0
 # Minimum rotation (°) to be corrected here, of a frame with right axes
 MIN_ROTATION_DEG = 15.0
-# Minimum time offset (s) to be corrected here; ClockOffset covers smaller ones
+# Minimum time offset (s) to be corrected here: ClockOffset contains smaller offsets
 MIN_LATE_S = 0.5
 # Minimum heading error (°) of a source's orientation relative to its positions, for a fault
 MIN_HEADING_ERROR_DEG = 10.0

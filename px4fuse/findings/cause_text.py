@@ -143,7 +143,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
         case changes.SIGMA_A | changes.SIGMA_Z:
             label, unit = name[:7].upper(), SETTING_UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
-    # a changed EKF2 parameter needs the model
+    # re-runs of EKF2 need its model
     assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
     return f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}".replace(

@@ -46,7 +46,7 @@ def detect(analysis: Analysis) -> Findings:
         reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
     title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
-    if is_small and is_default:  # a default is not the user's fault
+    if is_small and is_default:  # with PX4's default, name the sensor, not the parameter
         assumed = "KF and EKF2 assume" if is_shared else "EKF2 assumes"
         title = f"{sensor} noise is {format_factor(size)} times what {assumed}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)

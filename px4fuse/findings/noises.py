@@ -59,7 +59,7 @@ MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum ratio of actual to reported σ, or inverse, for severity error
 MIN_SIGMA_RATIO_ERROR = 2.0
-# Maximum ratio of two values of a noise that are equal: two standard errors of a median of 100
+# Maximum ratio of two values of a noise that count as equal: two standard errors of a median of 100
 # values
 NOISE_RATIO_TOLERANCE = 1.25
 # Minimum ratio of √R to EKF2_EVP_NOISE for an R that EKF2 takes from the position messages

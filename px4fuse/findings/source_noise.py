@@ -35,7 +35,8 @@ MIN_AXIS_RATIO = 1.5
 # Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for a
 # warning
 MIN_PART_RATIO = 2.0
-# Minimum value of the same ratio without outliers, for a warning
+# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight,
+# without outliers, for a warning
 MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5
 # Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for
 # severity error

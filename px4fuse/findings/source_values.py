@@ -28,7 +28,8 @@ MIN_OFFSET_M = 0.1
 MIN_OFFSET_SIGMAS = 4.0
 # Number of samples in a window in which two systems alternate; a lost sample reverses their order
 WINDOW = 16
-# Minimum number of such windows: with fewer, outliers of one system resemble two systems
+# Minimum number of windows in which two systems alternate: with fewer, outliers of one system
+# resemble two systems
 MIN_WINDOWS = 10
 # Maximum median distance (m) from EKF2's position of a copy that EKF2 does not fuse
 MAX_COPY_M = 0.01
@@ -48,7 +49,7 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
     ),
     "held": (
         "source_position_held",
-        "{positions} repeat an old position: the source has lost tracking",
+        f"{positions} repeat the last position: the source has lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
     ),
     "NaN": (
@@ -152,7 +153,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     )
     if source.alignment is not None:  # EKF2 did not fuse the file
         sensor = "sensor"
-        action = "Subtract it, rotated by the attitude, from the positions of the file."
+        action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
     yield warning(
         "source_lever_arm",
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
