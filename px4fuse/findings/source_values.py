@@ -49,7 +49,7 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
     ),
     "held": (
         "source_position_held",
-        f"{positions} repeat the last position: the source has lost tracking",
+        "{positions} repeat the last position: the source has lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
     ),
     "NaN": (
