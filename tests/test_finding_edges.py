@@ -294,7 +294,7 @@ def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
 
 
 CHECK_FIRST = (
-    "Check the line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+    "Check line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
 )
 
 
@@ -474,7 +474,7 @@ def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
         one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
-        assert ("Add the ULog" in finding.remedy) is has_ulog
+        assert ("Give the ULog" in finding.remedy) is has_ulog
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
@@ -502,7 +502,7 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
-    assert "by the positions and the IMU" in finding.message
+    assert "estimated from positions and IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
@@ -846,11 +846,11 @@ def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
-        assert "± 2 % (95 %)" in finding.message
+        assert "± 2 %, 95 %" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
-        assert ("may cover time-correlated errors" in finding.message) is (word == "large")
+        assert ("may include time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
