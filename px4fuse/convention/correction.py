@@ -36,7 +36,7 @@ class Faults:
     Attributes
     ----------
     axes : bool
-        True if the axes are not NED, apart from a rotation about the vertical.
+        True if the axes are not NED, even after a rotation about the vertical.
     rotation_deg : float
         Clockwise rotation of the positions relative to NED; relative to ENU or NWU for such axes.
     unit : bool

@@ -1,4 +1,4 @@
-"""Values of the source that are no measurements: zeros, held, rounded, mixed or copied."""
+"""Values of the source that are not measurements: zeros, held, rounded, mixed or copied."""
 
 from collections.abc import Mapping
 
