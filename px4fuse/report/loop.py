@@ -275,7 +275,8 @@ def describe_closure_error(loop: Loop) -> str:
     """Format the loop closure error in m, in percent of the path, per axis and in heading."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
-        return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
+        reason = loop.true_end.reason if isinstance(loop.true_end, Unavailable) else "not measured"
+        return f"path {loop.path_length_m:.1f} m; no closure error: {reason}"
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "
         f"{format_vector(misclosure)}"

@@ -36,7 +36,7 @@ def simulate_assigned(
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
-    log = flights.to_ulog(simulation)
+    log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]
     return log, Answer(
