@@ -4,18 +4,20 @@
 """
 
 import hashlib
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, table
+from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -61,11 +63,24 @@ MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHO
 # Corrections of injected faults that a form can name, with the units of their values (empty: no
 # value)
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
-VERDICTS = ("consistent", "overconfident", "underconfident")
+# Verdict on a filter without innovations
+NOT_AVAILABLE = "not available"
+VERDICTS = ("consistent", "overconfident", "underconfident", NOT_AVAILABLE)
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
-VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
+VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
+NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
+# Accepted values of the fields that are not numbers, for messages
+ACCEPTED_VALUES = {
+    **dict.fromkeys(
+        ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
+    ),
+    "when": "whole flight, or from_s and until_s",
+    "ekf2_did": "a list of texts",
+    "log_sha256": "the text of the empty form: make it again with px4fuse answers",
+    **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
+}
 # Answer to a question about a number: the number, a list of update numbers, or None (left blank)
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
@@ -203,7 +218,7 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     settings = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    limits = (1.0, 4.0) if third_kind == "prediction" else (1.3, 2.0)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
     duration_or_gate = draw_between(*limits, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *settings),
@@ -223,12 +238,38 @@ def read_answers(path: Path) -> Answers:
     text = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
     if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
+    record: dict[str, Any] = {}
     try:
-        answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
+        record = _as_record(tomllib.loads(text))
+        answers = msgspec.convert(record, Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct the form with the answers.") from error
+        message = _describe_error(error, text, record)
+        raise SettingsError(f"{path}: {message}", "Correct the form with the answers.") from error
     return answers
+
+
+def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
+    """Name the field, its value and the accepted values, or the line that is not TOML."""
+    message = str(error)
+    if line := re.search(r"\(at line (\d+), column \d+\)", message):
+        content = one_line(text.splitlines()[int(line[1]) - 1], 60)
+        return f"line {line[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
+    reason, _, path = message.partition(" - at `$.")
+    names = re.findall(r"\w+", path)
+    if not names:
+        return message
+    value: Any = record
+    for name in names:
+        value = value[int(name) if name.isdigit() else name]
+    field, number = names[-1], int(names[1]) + 1 if len(names) > 1 else 0
+    if isinstance(value, dict):
+        return f"mistake {number}: {reason}"
+    if names[0] == "quantities":
+        field = f"q{number}"
+    accepted = ACCEPTED_VALUES.get(field, NUMBER_HELP)
+    place = f" of mistake {number}" if names[0] == "mistakes" else ""
+    return f"{field}{place} is {one_line(str(value), 60)!r}; give {accepted}"
 
 
 def _as_record(form: dict[str, Any]) -> dict[str, Any]:

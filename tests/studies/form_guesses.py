@@ -25,6 +25,7 @@ from px4fuse.results.answer_form import (
     CORRECTIONS,
     EKF2_BEHAVIOURS,
     MISTAKES,
+    NOT_AVAILABLE,
     PANELS,
     VERDICTS,
     Answers,
@@ -114,7 +115,7 @@ def right(one: FormTruth) -> Answers:
         log_sha256=SHA256,
         mistakes=tuple(claims) or (StudentMistake("none"),),
         verdict_kf=one.kf.verdict,  # type: ignore[arg-type]
-        verdict_ekf2=one.ekf2.verdict,  # type: ignore[arg-type]
+        verdict_ekf2=one.ekf2.verdict or NOT_AVAILABLE,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
         quantities=one.quantities,
     )

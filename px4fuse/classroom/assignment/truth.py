@@ -186,6 +186,8 @@ def _ekf2_behaviour(
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large and reset.time_s > since_s:
             required.append("dead-reckoned, then reset")
+    if "never fused" in required:  # EKF2 cannot follow positions that it does not fuse
+        required, allowed = ["never fused"], [*required, *allowed]
     if not required:
         required, allowed = ["normal"], ["followed the positions", *allowed]
     required = [*dict.fromkeys(required)]

@@ -17,6 +17,7 @@ from px4fuse.core.record import table
 from px4fuse.results.answer_form import (
     MISTAKES,
     NO_MISTAKE_KIND,
+    NOT_AVAILABLE,
     Answers,
     QuantityAnswer,
     StudentMistake,
@@ -32,8 +33,10 @@ NEIGHBOUR_FRACTION = 0.4
 SAME_NUMBER_FRACTION = 2.0 / 3.0
 # Fraction of the points if the answer form names a consequence of the injected fault
 EFFECT_FRACTION = 0.15
-# Injected faults that can be guessed without a measurement: only the correct size has points. A
-# nearly correct size has no points, because the assigned sizes are close to each other
+# Relative error beyond the tolerance at which the size of a guessable fault has no points
+GUESSABLE_SIZE_RANGE = 0.08
+# Injected faults that can be guessed without a measurement: only a size that is nearly correct has
+# points, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
 # Tolerance (s) of start and end of an injected fault
@@ -217,8 +220,11 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
         first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
         is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
         return is_right / 3.0
-    is_close = abs(size - mistake.size) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
-    close_fraction = 0.5 * (is_close and mistake.kind not in GUESSABLE_KINDS)
+    deviation = abs(size - mistake.size) / abs(mistake.size)
+    close_fraction = 0.5 * (deviation <= HALF_SIZE_TOLERANCE)
+    if mistake.kind in GUESSABLE_KINDS:  # decreases from 1 at the tolerance
+        tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
+        close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
     return _value_fraction(size, mistake.low, mistake.high, close_fraction)
 
 
@@ -299,7 +305,7 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
 def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
     """Return the fraction of the points for the verdicts on KF and EKF2, and EKF2's behaviour."""
     pairs = (answers.verdict_kf, truth.kf.verdict), (answers.verdict_ekf2, truth.ekf2.verdict)
-    right_count = sum(bool(answer) and answer == right for answer, right in pairs)
+    right_count = sum(answer == (right or NOT_AVAILABLE) for answer, right in pairs)
     return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
 
 
@@ -328,7 +334,8 @@ def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
-    if isinstance(answer, tuple) and isinstance(true_value, tuple):
+    if isinstance(true_value, tuple) and answer is not None:
+        answer = answer if isinstance(answer, tuple) else (answer,)
         difference_count = len(set(answer) ^ set(true_value))
         has_right_number = not set(answer).isdisjoint(true_value)
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number

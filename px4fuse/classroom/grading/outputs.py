@@ -257,7 +257,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
             *(report.numbers.get(title) if report else None for title in numbers),
             entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
-            report.instructor_action if report else "",
+            report.pending_reason if report else "",
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
             LIST_SEPARATOR.join(other.submission for other in entry.other_reports),
