@@ -24,6 +24,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
     LOOP_FRACTION,
+    derive_key,
     draw,
 )
 from px4fuse.classroom.assignment.roster import Person
@@ -231,14 +232,14 @@ class TestAssign:
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the generated secret can be given later
-        assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
+        assign(CLASS, folder, key_file, derive_key(key.secret), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
     def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
-        for students, secret in ((CLASS, b"another secret"), (CLASS[1:], SECRET)):
+        for students, secret in ((CLASS, b"another secret"), (CLASS[2:], SECRET)):
             with pytest.raises(OutputError, match="was not overwritten"):
                 assign(students, folder, key_file, secret, "aisle", 2)
         with pytest.raises(OutputError, match="other flights"):
@@ -347,7 +348,7 @@ class TestCommand:
     def at(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "roster.csv").write_text("id,name\ns01,=cmd|x\ns02,<b>\n")
-        (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
+        (tmp_path / "secret.txt").write_text("\ufeffour secret of 2026\r\n", encoding="utf-8")
         return tmp_path
 
     def test_simulate_preview_prints_flights_without_writing_files(self, at):

@@ -8,14 +8,17 @@ from typing import NamedTuple
 
 import pytest
 from cli_tools import error_line, run, run_checked
+from exchange import replace
+from form_guesses import right
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned
 from px4fuse.classroom.assignment.roster import Person
+from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.flight.log import WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
-from px4fuse.results.answer_form import form_text
+from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
 
@@ -95,3 +98,26 @@ def test_report_of_log_without_mark_is_not_verified(assigned: Assigned, tmp_path
     result = run("verify", tmp_path / "copy.pdf", assigned.log)
     assert result.exit_code != 0
     assert "other log" in result.stdout
+
+
+def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
+    _, answer = simulate_assigned(SECRET, Person("s1"), "aisle", 1)
+    assert answer.form is not None
+    predictions = answer.form.predictions
+    assert len(predictions) >= 6
+    for question, letter in predictions:
+        assert sorted(question.limits) == list(question.limits)
+        assert f"{letter}: " in question.text
+    assert len({letter for _, letter in predictions}) > 1
+
+
+def test_predictions_outweigh_a_diagnosis_without_evidence() -> None:
+    _, answer = simulate_assigned(SECRET, Person("s01"), "aisle", 2)
+    assert answer.form is not None
+    complete = right(answer.form)
+    assert form_points(complete, answer.form).fraction == pytest.approx(1.0)
+    copied = replace(complete, predictions=())
+    assert form_points(copied, answer.form).fraction == pytest.approx(DIAGNOSIS_SHARE)
+    for letter in PREDICTION_RANGES:
+        guessed = replace(complete, predictions=(letter,) * len(complete.predictions))
+        assert form_points(guessed, answer.form).fraction < 0.6

@@ -24,7 +24,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from form_guesses import at_random, constants, right
+from form_guesses import at_random, constants, guess_predictions, right
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
@@ -171,7 +171,10 @@ def main() -> None:
 
     print(f"{'ideal':14} {mean_points(lambda n: right(truths[n])):5.1f}")
     for name in made[0][1]:
-        print(f"{name:14} {mean_points(partial(lambda name, n: made[n][1][name], name)):5.1f}")
+        guess = partial(
+            lambda name, n: replace(made[n][1][name], predictions=guess_predictions(rng)), name
+        )
+        print(f"{name:14} {fmean(mean_points(guess) for _ in range(20)):5.1f}")
     print(f"{'random':14} {fmean(mean_points(lambda _: at_random(rng)) for _ in range(20)):5.1f}")
     kinds = {mistake.kind for one in truths for mistake in one.mistakes} | {"none"}
     best = max(

@@ -18,11 +18,15 @@ from px4fuse.results.answer_form import (
     MISTAKES,
     NO_MISTAKE_KIND,
     NOT_AVAILABLE,
+    PREDICTION_RANGES,
     Answers,
     QuantityAnswer,
     StudentMistake,
 )
 
+# Fraction of the points for the diagnosis if the answer key has predictions: the diagnosis can be
+# copied from px4fuse, the predictions from no output
+DIAGNOSIS_SHARE = 0.2
 # Points that are deducted for each false fault, which the flight does not have
 FALSE_MISTAKE_POINTS = 10.0
 # Number of false faults in an answer form from which its right faults have no points either
@@ -120,9 +124,19 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
+    if truth.predictions:
+        weights = {name: DIAGNOSIS_SHARE * points for name, points in weights.items()}
+        weights["predictions"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
+        points_by_part = {name: DIAGNOSIS_SHARE * each for name, each in points_by_part.items()}
+        points_by_part["predictions"] = weights["predictions"] * _prediction_fraction(
+            answers, truth
+        )
     named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
-    feedback = tuple(_mistake_feedback(matches, false_mistakes, is_clean_named))
+    feedback = (
+        *_mistake_feedback(matches, false_mistakes, is_clean_named),
+        *_prediction_feedback(answers, truth),
+    )
     return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
 
 
@@ -139,15 +153,39 @@ def _mistake_feedback(
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
+        right_answer = _describe_right_answer(mistake)
         if student_mistake is None:
-            yield f"you did not name {mistake_text}"
+            yield f"you did not name {mistake_text}: {right_answer}"
         elif student_mistake.kind != mistake.kind:
-            yield f"you named {student_mistake.kind} instead of {mistake_text}"
+            yield f"you named {student_mistake.kind} instead of {mistake_text}: {right_answer}"
         else:
-            yield f"you named {mistake.kind}, which is right"
+            yield f"you named {mistake.kind}, which is right: {right_answer}"
     if false_mistakes:
         kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
         yield f"your flight does not have {kinds}"
+
+
+def _describe_right_answer(mistake: TrueMistake) -> str:
+    """State the right size, the time and the panels of the report that show the fault."""
+    texts = []
+    if mistake.low is not None and mistake.high is not None:
+        unit = next(iter(MISTAKES[mistake.kind].units), "")
+        texts.append(f"right size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
+    starts = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
+    ends = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
+    texts.append(f"{starts}{ends}".strip() or "whole flight")
+    return ", ".join([*texts, f"shown in {' or '.join(panels(mistake.kind))}"])
+
+
+def _prediction_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
+    """Yield a clause with the right range for each prediction that is wrong or missing."""
+    given = dict(enumerate(answers.predictions))
+    for index, (question, right) in enumerate(truth.predictions):
+        if given.get(index) != right:
+            yield (
+                f"p{index + 1}, {question.quantity}: range {right} is right, you gave "
+                f"{given.get(index) or 'none'}"
+            )
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
@@ -323,6 +361,17 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
         len(required_behaviours) == 1 and stated_behaviours & also_allowed
     )
     return 1.0 if is_complete and not false_count else 0.5
+
+
+def _prediction_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for predictions; guesses have no points on average."""
+    given = dict(enumerate(answers.predictions))
+    guessed_points = -1.0 / (len(PREDICTION_RANGES) - 1)
+    points = [
+        0.0 if not given.get(index) else 1.0 if given[index] == right else guessed_points
+        for index, (_, right) in enumerate(truth.predictions)
+    ]
+    return max(sum(points) / len(points), 0.0)
 
 
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
