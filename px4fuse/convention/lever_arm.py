@@ -16,7 +16,7 @@ from px4fuse.trajectory.rotation import to_matrix
 # Minimum lever arm (m) for a finding: twice the noise of good UWB
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
-MIN_ARM_SIGMAS = 4.0
+MIN_ARM_SIGMAS = 2.5
 # Maximum residual in σ of a sample that is used
 CLIPPED_SIGMAS = 3.0
 # Number of least squares fits with outlier removal

@@ -33,7 +33,7 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Unavailable, positions_of, reset_times_s, source_name
 from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions, from 5 to 95 %, for a vehicle that moves
@@ -181,7 +181,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
-    reset_s = _reset_times(analysis)
+    reset_s = reset_times_s(analysis.source)
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
@@ -193,24 +193,22 @@ def detect_jumps(analysis: Analysis) -> Findings:
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
             cause = "The source announced it (reset_counter): it relocalised or set a new origin."
         extent = f"by {size_m:.2f} m"
+        steps_m = np.array([[step.value for step in jump.step_m] for jump in large])
+        end = "stay there"
+        if np.linalg.norm(steps_m.sum(axis=0)) < MIN_JUMP_M:
+            end = "return afterwards"
         if len(large) > 1:
             extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} jump {extent} at {at_s:.1f} s and stay there. The IMU measures no such "
+            f"{positions} jump {extent} at {at_s:.1f} s and {end}. The IMU measures no such "
             f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
             "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
             f"{action} Analyse one side of the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
-
-
-def _reset_times(analysis: Analysis) -> Array:
-    """Return the times (s) at which ``reset_counter`` changes."""
-    counter = analysis.source.status.get("reset_counter", pd.Series(dtype=float))
-    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:

@@ -141,16 +141,21 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if arm is None:
         return
     forward_m, right_m, sigma_m = arm
-    sensor = "sensor" if source.origin.kind == "file" else f"{source_name(source)} sensor"
+    sensor = f"{source_name(source)} sensor"
+    action = (
+        f"Set EKF2_EV_POS_X to {source.lever_arm_m[0] + forward_m:.2f} m and EKF2_EV_POS_Y to "
+        f"{source.lever_arm_m[1] + right_m:.2f} m."
+    )
+    if source.alignment is not None:  # EKF2 did not fuse the file
+        sensor = "sensor"
+        action = "Subtract it, rotated by the attitude, from the positions of the file."
     yield warning(
         "source_lever_arm",
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
         f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
         "lever arm. Estimates from the positions are left out.",
-        "Measure the position of the sensor relative to the IMU. Set EKF2_EV_POS_X to "
-        f"{source.lever_arm_m[0] + forward_m:.2f} m and EKF2_EV_POS_Y to "
-        f"{source.lever_arm_m[1] + right_m:.2f} m.",
+        f"Measure the position of the sensor relative to the IMU. {action}",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 
