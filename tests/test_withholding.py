@@ -15,12 +15,14 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
+from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.flight.log import WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
 from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
+from px4fuse.verification.model import Verdict
 
 SECRET = b"a secret for tests"
 
@@ -121,3 +123,13 @@ def test_predictions_outweigh_a_diagnosis_without_evidence() -> None:
     for letter in PREDICTION_RANGES:
         guessed = replace(complete, predictions=(letter,) * len(complete.predictions))
         assert form_points(guessed, answer.form).fraction < 0.6
+
+
+def test_grade_flags_answer_form_of_other_log(assigned: Assigned) -> None:
+    student = assigned.results.student
+    other = replace(student, answers=replace(student.answers, log_sha256="0" * 64))
+    results = replace(assigned.results, student=other)
+    report = score_report(results, Verdict("verified", (), True), read_rubric(None), None)
+    assert report.counted_points is None
+    assert "made for another log" in report.pending_reason
+    assert report.pending_reason in report.flags
