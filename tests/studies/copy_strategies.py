@@ -9,7 +9,8 @@ and prints the mean points (of 100) of each strategy:
 - package: all functions of the package, which ignore the mark, and the numbers of KF
 - random, and the best constant form of :mod:`form_guesses`
 
-Answers that a strategy cannot copy are guessed at random.
+Predictions cannot be copied, so these strategies guess them at random. No strategy re-runs EKF2
+with the correction of a fault: whoever does that has understood the fault.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+import pandas as pd
 from form_guesses import at_random, constants, guess_predictions, right
 from msgspec.structs import replace
 
@@ -62,9 +64,12 @@ KIND_BY_FINDING = {
 def sizes(analysis: Analysis) -> dict[str, TrueMistake]:
     """Return each fault with the size and times that the outputs state, if they state a size."""
     parameters, found = analysis.flight.log.parameters, {}
-    rate_hz = 1.0 / np.median(np.diff(analysis.flight.imu.index))
+    assert isinstance(analysis.flight.imu, pd.DataFrame)
+    rate_hz = float(1.0 / np.median(np.diff(analysis.flight.imu.index)))
     innovations = analysis.main.ekf2_innovations
-    rejected = float((innovations["rejected"] > 0).mean()) if hasattr(innovations, "mean") else 0.0
+    rejected = 0.0
+    if isinstance(innovations, pd.DataFrame):
+        rejected = float((innovations["rejected"] > 0).mean())
     values: dict[str, float | None] = {
         "ekf2-delay": 1e-3 * parameters.get("EKF2_EV_DELAY", 0.0),
         "ekf2-noise": parameters.get("EKF2_EVP_NOISE"),
@@ -100,16 +105,16 @@ def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> FormTruth:
     """Return the answers that follow from the outputs, for these faults."""
     known = sizes(analysis)
     mistakes = tuple(known[kind] for kind in kinds if kind in known)
-    verdicts = [
-        VerdictTruth(getattr(analysis.main.filters[name], "verdict", "")) for name in ("kf", "ekf2")
-    ]
+    filters = analysis.main.filters
+    kf = VerdictTruth(getattr(filters["kf"], "verdict", ""))
+    ekf2 = VerdictTruth(getattr(filters["ekf2"], "verdict", ""))
     tuning = analysis.tuning.get(HORIZONTAL)
     sigma_z_m = (tuning.sigma_z.value if isinstance(tuning, AxisTuning) else None) or 0.1
     behaviour = _ekf2_behaviour(analysis, mistakes, sigma_z_m)
     numbers = tuple(
         quantity_truth(analysis.main, question) for question in draw_questions(log_sha256)
     )
-    return FormTruth(mistakes, sigma_z_m, *verdicts, *behaviour, numbers)
+    return FormTruth(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
 
 
 def rule_kinds(analysis: Analysis, loop: Loop | None) -> list[str]:
