@@ -62,7 +62,7 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a" * 30_000, "the file has 0.03 MB; the limit is 0.02 MB"),
+        ("a" * 30_000, "the file has 0.03 MB, more than the limit of 0.02 MB"),
         ("a." * 400 + "b = 1", "a line has more than 500"),
         (EMPTY.replace('q1 = ""', "q1 = 0,5"), "(q1 = 0,5) is not valid; give a number"),
         (EMPTY.replace('q1 = ""', 'q1 = "half"'), "q1 is 'half'; give a number"),
@@ -70,8 +70,8 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
          "size of mistake 1 is 'big'; give a number"),
         (EMPTY.replace('verdict_kf = ""', 'verdict_kf = "good"'),
          "verdict_kf is 'good'; give one of consistent, overconfident"),
-        ("x = " + "[" * 450, "Correct the form with the answers"),
-        ("log_sha256 = 'x'", "Correct the form with the answers"),
+        ("x = " + "[" * 450, "Correct the answer form"),
+        ("log_sha256 = 'x'", "Correct the answer form"),
         (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
         (EMPTY + CLAIM.format("yaw", "size = 900"), "is out of range"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = nan"), "size"),

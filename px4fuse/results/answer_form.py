@@ -84,7 +84,7 @@ ACCEPTED_VALUES = {
     "log_sha256": "the text of the empty form: make it again with px4fuse answers",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
-# Answer to a question about a number: the number, a list of update numbers, or None (left blank)
+# Answer to a question about a number: the number, a list of update numbers, or None (no answer)
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
@@ -201,7 +201,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Quantities that the questions of a form can request: one of each pair is drawn at random
+# Pairs of quantities for the questions of a form: one of each pair is drawn at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -286,7 +286,7 @@ def read_answers(path: Path) -> Answers:
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
         message = _describe_error(error, text, record)
-        raise SettingsError(f"{path}: {message}", "Correct the form with the answers.") from error
+        raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
 
 
@@ -324,7 +324,9 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
         {*quantities, *({"mistakes"} & filled_form.keys())} - set(names)
         | predictions.keys() - set(prediction_names)
     ):
-        raise ValueError(f"the field {unknown_fields[0]} is not one of mistake, {', '.join(names)}")
+        raise ValueError(
+            f"the field {unknown_fields[0]} is unknown; known fields: mistake, {', '.join(names)}"
+        )
     return {
         **filled_form,
         "mistakes": mistakes,
@@ -360,9 +362,11 @@ def check_answers(answers: Answers) -> None:
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)
         if kinds.count(kind) > 1:
-            raise ValueError(f"kind {kind!r} is given twice; give each kind of mistake once")
+            raise ValueError(
+                f"the form names the kind {kind!r} twice; name each kind of fault once"
+            )
     if NO_MISTAKE_KIND in kinds and len(kinds) > 1:
-        raise ValueError('kind "none" is given together with a mistake; give only one of them')
+        raise ValueError('the form names "none" and a fault; name only one of them')
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for student_mistake in answers.mistakes:
@@ -387,9 +391,8 @@ def check_answers(answers: Answers) -> None:
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
     if value not in choices:
-        allowed = _join_quoted(choices)
-        reason = f"is not one of {allowed}" if allowed else "is not allowed: leave this field empty"
-        raise ValueError(f"{field} {value!r} {reason}")
+        allowed = _join_quoted(choices) or "an empty field"
+        raise ValueError(f"{field} {value!r} is not one of {allowed}")
 
 
 def form_name(log_name: str) -> str:
