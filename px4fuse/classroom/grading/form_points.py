@@ -166,11 +166,11 @@ def _mistake_feedback(
 
 
 def _describe_right_answer(mistake: TrueMistake) -> str:
-    """State the right size, the time and the panels of the report that show the fault."""
+    """State the accepted size, the time and the panels of the report that show the fault."""
     texts = []
     if mistake.low is not None and mistake.high is not None:
         unit = next(iter(MISTAKES[mistake.kind].units), "")
-        texts.append(f"right size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
+        texts.append(f"accepted size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
     starts = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
     ends = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
     texts.append(f"{starts}{ends}".strip() or "whole flight")
