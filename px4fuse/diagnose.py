@@ -270,12 +270,6 @@ def run_what_if(
         difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
-            if not changes:
-                name, noise = comparison.source.name, model.inputs.aid.noise
-                raise MissingDataError(
-                    f"{flight.log.name}: this log shows no better noise or delay for {name}.",
-                    f"Give a changed parameter, for example `changes` {noise}=0.1.",
-                )
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
     progress("replaying EKF2 with other parameters")
