@@ -48,6 +48,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
+from px4fuse.flight.log import WITHHELD
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
@@ -98,13 +99,14 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
+    flight = comparison.flight
     analysis = Analysis(
         **vars(comparison),
         **vars(estimates),
         **vars(reruns),
         events=collect_events(comparison),
-        aids=evaluate_aids(comparison.flight),
-        loop=analyse_flight_loop(comparison.flight, progress),
+        aids=WITHHELD if flight.log.is_assessed else evaluate_aids(flight),
+        loop=analyse_flight_loop(flight, progress),
     )
     return replace(analysis, findings=find(analysis))
 
@@ -176,6 +178,9 @@ def intervene(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
     """Replay EKF2, explain the difference KF - EKF2, and re-run both filters with changes."""
+    if comparison.flight.log.is_assessed:
+        withheld_steps = dict.fromkeys(comparison.axes, WITHHELD)
+        return Reruns(ekf2_model=WITHHELD, difference_steps=withheld_steps, trials=())
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     model = open_model(
@@ -243,15 +248,17 @@ def run_what_if(
             )
     recordings = ComparisonRequest(log=request.log, system=request.system)
     flight = flight or read_flight(recordings, progress)
+    is_default_change = not changes and sweep is None and not request.without
+    if flight.log.is_assessed and is_default_change:
+        raise MissingDataError(f"{flight.log.name}: {WITHHELD.reason}", "Give --set or --sweep.")
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
-    is_default_change = not changes and sweep is None and not request.without
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:
-        if model.agreement.good:
+        if model.agreement.good and not flight.log.is_assessed:
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))

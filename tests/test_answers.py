@@ -64,6 +64,12 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     [
         ("a" * 30_000, "the file has 0.03 MB, more than the limit of 0.02 MB"),
         ("a." * 400 + "b = 1", "a line has more than 500"),
+        (EMPTY.replace('q1 = ""', "q1 = 0,5"), "(q1 = 0,5) is not valid; give a number"),
+        (EMPTY.replace('q1 = ""', 'q1 = "half"'), "q1 is 'half'; give a number"),
+        (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', 'size = "big"'),
+         "size of mistake 1 is 'big'; give a number"),
+        (EMPTY.replace('verdict_kf = ""', 'verdict_kf = "good"'),
+         "verdict_kf is 'good'; give one of consistent, overconfident"),
         ("x = " + "[" * 450, "Correct the answer form"),
         ("log_sha256 = 'x'", "Correct the answer form"),
         (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
@@ -76,7 +82,7 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
         (EMPTY + CLAIM.format("yaw", 'unit = "kg"'), "'kg' is not one of"),
         (EMPTY + CLAIM.format("yaw", 'panel = "sky"'), "'sky' is not one of"),
         (EMPTY + CLAIM.format("yaw", 'parameter = "EKF3"'), "'EKF3' is not one of"),
-        (EMPTY.replace('q1 = ""', "q1 = inf"), "quantities"),
+        (EMPTY.replace('q1 = ""', "q1 = inf"), "q1 is 'inf'"),
         (EMPTY.replace('q1 = ""', 'q1 = ""\nq9 = 1'), "q9"),
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
@@ -144,3 +150,16 @@ def test_compare_answers_option_adds_answer_form_to_report(
     assert isinstance(results, ComparisonResults)
     assert results.student.answers.names_no_mistake  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)
+
+
+def test_compare_rejects_answer_form_of_other_log(tmp_path: Path, sample_log: Path) -> None:
+    form = tmp_path / "f.toml"
+    form.write_text(form_text(sample_log.name, SHA256), encoding="utf-8")
+    for command in ("compare", "loop"):
+        said = error_line(command, sample_log, "--answers", form, "-o", tmp_path / "r.pdf")
+        assert "f.toml was made for another log than" in said
+
+
+def test_read_answer_form_accepts_verdict_not_available(tmp_path: Path) -> None:
+    text = EMPTY.replace('verdict_ekf2 = ""', 'verdict_ekf2 = "not available"')
+    assert read(tmp_path, text).verdict_ekf2 == "not available"

@@ -24,6 +24,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
     LOOP_FRACTION,
+    derive_key,
     draw,
 )
 from px4fuse.classroom.assignment.roster import Person
@@ -32,6 +33,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
+from px4fuse.readers import ulog_topics
 from px4fuse.results.answer_form import Answers, read_answers
 from px4fuse.simulation.mistakes import parse
 
@@ -170,10 +172,13 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_assigned_log_has_a_finding_for_each_fault_of_key(tmp_path, kind, number, count):
+def test_assigned_log_has_a_finding_for_each_fault_of_key(
+    tmp_path, monkeypatch, kind, number, count
+):
     log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
+    monkeypatch.setattr(ulog_topics, "ASSESSED_KEY", "no such key")
     flight = px4fuse.read_log(path)
     assert flight.log.sha256 == answer.sha256
     if kind == "loop":
@@ -227,14 +232,14 @@ class TestAssign:
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the generated secret can be given later
-        assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
+        assign(CLASS, folder, key_file, derive_key(key.secret), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
     def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
-        for students, secret in ((CLASS, b"another secret"), (CLASS[1:], SECRET)):
+        for students, secret in ((CLASS, b"another secret"), (CLASS[2:], SECRET)):
             with pytest.raises(OutputError, match="was not overwritten"):
                 assign(students, folder, key_file, secret, "aisle", 2)
         with pytest.raises(OutputError, match="other flights"):
@@ -343,7 +348,7 @@ class TestCommand:
     def at(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "roster.csv").write_text("id,name\ns01,=cmd|x\ns02,<b>\n")
-        (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
+        (tmp_path / "secret.txt").write_text("\ufeffour secret of 2026\r\n", encoding="utf-8")
         return tmp_path
 
     def test_simulate_preview_prints_flights_without_writing_files(self, at):

@@ -388,7 +388,21 @@ def test_submission_time_without_zone_uses_zone_of_due_time() -> None:
     assert add_time_zone(told, due) == due
 
 
-def test_parse_moodle_time_accepts_only_english_dates() -> None:
-    assert parse_moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
-    assert parse_moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
-    assert parse_moodle_time("Freitag, 20. November 2026, 23:58") is None
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Friday, 20 November 2026, 23:58",
+        "Friday, 20 November 2026, 11:58 PM",
+        "Freitag, 20. November 2026, 23:58",
+        "2026-11-20 23:58",
+    ],
+)
+def test_parse_moodle_time_accepts_english_german_and_iso_dates(text: str) -> None:
+    assert parse_moodle_time(text) == datetime(2026, 11, 20, 23, 58)
+
+
+def test_read_overrides_with_unquoted_comma_names_the_row(tmp_path: Path) -> None:
+    path = tmp_path / "overrides.csv"
+    path.write_text("id,item,points,comment\n0001,,,Good, but late\n", encoding="utf-8")
+    with pytest.raises(SettingsError, match="row 2 has more cells than the header"):
+        read_overrides(path)

@@ -111,8 +111,7 @@ def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
         given = dict(context.params)
         for name in ("output", "json_path", "fail_on", "checks", "verbose", "quiet"):
             given.pop(name, None)
-        read_student(given)
-        given.pop("log")
+        read_student(given, given.pop("log"))
         return comparison_request(sample_log, given)
 
 

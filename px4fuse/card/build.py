@@ -74,6 +74,7 @@ HEADING_HIDES_ERROR = (
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
 )
+WITHHELD_HEADLINE = "Assignment: the diagnosis is the student's, and px4fuse withholds its own"
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
 # Reasons why verdicts against source and ground truth differ, by ids of findings about the source
 SENTENCES_BY_SOURCE_FAULT = (
@@ -108,6 +109,18 @@ def build_card(
         Name and id of the student.
     """
     source, segment = analysis.source, analysis.segment
+    identity = _identity(
+        analysis.flight.log,
+        request,
+        student,
+        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+        settings=_settings(analysis, request),
+        changed=_changed_settings(request),
+        parameters=_changed_parameters(analysis),
+        segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
+    )
+    if analysis.flight.log.is_assessed:
+        return Card(severity="note", headline=WITHHELD_HEADLINE, identity=identity)
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     verdicts = make_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, root_findings)
@@ -142,16 +155,7 @@ def build_card(
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
         notes=_make_notes(root_findings, request.log),
-        identity=_identity(
-            analysis.flight.log,
-            request,
-            student,
-            source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
-            settings=_settings(analysis, request),
-            changed=_changed_settings(request),
-            parameters=_changed_parameters(analysis),
-            segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
-        ),
+        identity=identity,
     )
 
 

@@ -61,7 +61,7 @@ def compare(
     from px4fuse.report.terminal import card_page, summary
     from px4fuse.results.build import outcome_results
 
-    student = options.read_student(option_values)
+    student = options.read_student(option_values, log)
     request = options.comparison_request(log, option_values)
     outputs.report_paths(output, json_path)  # report an invalid path before the long analysis
     try:

@@ -221,6 +221,11 @@ def _page(outcome: GradeOutcome) -> Page:
         f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
         f"{outcome.reused_count} submissions"
     )
+    for entry in outcome.entries:
+        report = entry.counted_report
+        if report is not None and entry.total is None:
+            name = one_line(entry.display_name, 60)
+            page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)
     return page

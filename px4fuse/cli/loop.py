@@ -167,7 +167,8 @@ def loop(
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    student = options.read_student(option_values)
+    log = split_part(str(source))[0]
+    student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(

@@ -5,6 +5,7 @@ Users type numbers without a unit. If a unit is typed, the error shows the conve
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -16,7 +17,7 @@ from click.core import ParameterSource
 
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
-from px4fuse.core.reading import max_log_bytes, read_text
+from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
@@ -381,13 +382,14 @@ def typed_parameters() -> Iterator[click.Parameter]:
             yield parameter
 
 
-def read_student(option_values: dict[str, Any]) -> Student:
+def read_student(option_values: dict[str, Any], log: Path) -> Student:
     """Take the values of ``student_options`` out of the option values, and read their files.
 
     Raises
     ------
     SettingsError
-        The notes or the answer form cannot be read, or the notes cannot be printed.
+        The notes or the answer form cannot be read, the form is for another log, or the notes
+        cannot be printed.
     """
     from msgspec import UNSET
 
@@ -402,6 +404,11 @@ def read_student(option_values: dict[str, Any]) -> Student:
         notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
         parse(notes, f"--notes {notes_path}")  # report errors in the notes before the analysis
     answers = UNSET if answers_path is None else read_answers(answers_path)
+    if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
+        raise SettingsError(
+            f"--answers {answers_path} was made for another log than {log.name}.",
+            f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
+        )
     student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
     _warn_missing_fonts(student.name + student.id + student.notes)
     return student

@@ -34,6 +34,7 @@ from px4fuse.filter.time_offset import (
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
+from px4fuse.flight.log import WITHHELD
 from px4fuse.flight.model import Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
@@ -89,6 +90,16 @@ class Estimates:
     noisy_part: NoisyPart | None = None
 
 
+WITHHELD_ESTIMATES = Estimates(
+    tuning={HORIZONTAL: WITHHELD},
+    clock=WITHHELD,
+    heading=WITHHELD,
+    bias_scale_jump_fit=WITHHELD,
+    source_low_pass=WITHHELD,
+    time_correlated_noise=WITHHELD,
+)
+
+
 def ignore_progress(_: str) -> None:
     """Ignore the name of a step of the computation."""
 
@@ -106,6 +117,8 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and errors of the source."""
+    if comparison.flight.log.is_assessed:
+        return WITHHELD_ESTIMATES
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -141,6 +154,8 @@ def tuned(
         IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
+    if flight.log.is_assessed:
+        return dict(WITHHELD_ESTIMATES.tuning)
     return tune(
         comparison.lines,
         comparison.settings,
@@ -163,6 +178,8 @@ def estimate_noises_and_clock(
     """
     signal_cache: SignalCache = {}  # both estimates use the same IMU signals
     tuning = tuned(comparison, names, progress, signal_cache)
+    if comparison.flight.log.is_assessed:
+        return tuning, WITHHELD
     if slow_imu := missing_imu_rate(comparison.flight):
         return tuning, slow_imu
     settings, axis_tuning = comparison.settings, first_axis_tuning(tuning, HORIZONTAL, *tuning)

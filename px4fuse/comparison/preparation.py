@@ -72,7 +72,8 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
     is_in_ned = track.origin.is_gnss or track.origin.path == "aligned by EKF2"
-    convention = None if as_sent or is_in_ned else check_convention(flight, track)
+    is_withheld = as_sent or is_in_ned or flight.log.is_assessed
+    convention = None if is_withheld else check_convention(flight, track)
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s

@@ -17,7 +17,7 @@ import msgspec
 def to_json_types(value: object) -> Any:
     """Convert records, mappings and tuples to dicts and lists for JSON.
 
-    None, NaN and infinity in a dict are omitted.
+    None, UNSET, NaN and infinity in a dict are omitted.
 
     >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
@@ -31,7 +31,7 @@ def to_json_types(value: object) -> Any:
         return {name: child for name, child in children.items() if child is not None}
     if isinstance(value, list | tuple):
         return list(map(to_json_types, value))
-    if isinstance(value, float) and not math.isfinite(value):
+    if value is msgspec.UNSET or (isinstance(value, float) and not math.isfinite(value)):
         return None
     return value
 

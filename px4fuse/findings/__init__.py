@@ -74,14 +74,19 @@ DETECTORS = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Return the findings, most severe first, each cause followed by its consequences."""
+    """Return the findings, most severe first, each cause followed by its consequences.
+
+    The findings of a flight that is an assignment are withheld.
+    """
+    if analysis.flight.log.is_assessed:
+        return ()
     findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """Return the findings about a loop and its closures, most severe first."""
-    return group_by_cause(loops.detect_in_loop(loop))
+    return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
 
 
 def find_aids(results: Mapping[str, AidResult], ekf2: object = None) -> tuple[Finding, ...]:

@@ -4,13 +4,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
+
 from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Sha256, Share
+from px4fuse.core.record import Count, NotNegative, Record, Sha256, Share, Unavailable
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 
 SHARED_STAMPS = "most timestamps are repeated"
 # Name of the clock of timestamps that PX4 converted from the sender's clock, or replaced
 SENDER_CLOCK = "sender timestamps"
+# Used in place of each estimate, re-run and diagnosis of a flight that is an assignment
+WITHHELD = Unavailable(
+    "diagnosis",
+    "the flight is an assignment, so px4fuse withholds its diagnosis",
+    "Analyse the flight with your own settings, and give your diagnosis with --answers.",
+)
 
 
 class Dropout(Record, frozen=True):
@@ -161,6 +169,8 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
         Senders of a MAVLink recording, most messages first.
     vehicle : str
         Hexadecimal identifier of the flight controller; empty if not in the log.
+    is_assessed : True or UNSET
+        True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis.
     """
 
     name: str
@@ -186,6 +196,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     receive_time_reversals: Count | None = None
     dropped: Mapping[str, Count] = {}
     parameter_defaults: Mapping[str, int | float] = {}
+    is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
 
     __repr__ = one_line_repr
 

@@ -53,7 +53,7 @@
   const boxes = (owner, rows, otherRows) => {
     const node = make("div", "", "boxes");
     for (const [item, max, points, comment] of rows) {
-      const number = make("input", "", { type: "number", min: 0, max, step: "any", value: points ?? "" });
+      const number = make("input", "", { inputMode: "decimal", size: 6, value: points ?? "" });
       const text = make("textarea", comment, { rows: 2, dir: "auto" });
       for (const [title, field] of [[`Points for ${item} (maximum ${max})`, number], ["Comment", text]]) {
         node.append(fill(makeIsolated("label", title), [field]));

@@ -24,7 +24,7 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import Stream
+from px4fuse.flight.log import WITHHELD, Stream
 from px4fuse.flight.model import (
     Ekf2,
     Flight,
@@ -317,7 +317,8 @@ def _analysis_options(
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
         )
         yield AnalysisOption("compare", True, description)
-    imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
+    findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
+    imu_reason = " ".join(finding.message for finding in findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
         imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
@@ -372,6 +373,8 @@ def _logging_advice(
     flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings on the recording and of missing data, each action once."""
+    if flight.log.is_assessed:
+        return (LoggingAdvice("None", (WITHHELD.reason,)),)
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:

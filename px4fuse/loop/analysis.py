@@ -7,6 +7,7 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
+from px4fuse.flight.log import WITHHELD
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
@@ -67,6 +68,7 @@ def analyse(
     _require_in_range("heading_drift_deg", noise.heading_deg, 1e-4)
     trajectory = source.trajectory
     flight = source.flight
+    is_assessed = flight is not None and bool(flight.log.is_assessed)
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
     def to_track_time(time_s: float) -> float:
@@ -84,7 +86,7 @@ def analyse(
         if end_truth is None
         else loop_segment.read_end_from_truth(path, end_truth, segment, rests_at_ends)
     )
-    true_end = _find_true_end(path, request, truth_end, segment)
+    true_end = _find_true_end(path, request, truth_end, segment, is_assessed=is_assessed)
     given_closures = [
         GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
         for c in request.closures
@@ -149,11 +151,17 @@ def analyse(
         graph=graph,
         references=references,
         original_frame=trajectory.frame,
+        is_assessed=is_assessed,
     )
 
 
 def _find_true_end(
-    path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None, segment: Segment
+    path: Trajectory,
+    request: LoopRequest,
+    truth_end: TrueEnd | str | None,
+    segment: Segment,
+    *,
+    is_assessed: bool,
 ) -> TrueEnd | Unavailable:
     """Find the landing place: as measured, from ground truth, or assumed at the take-off place."""
     if request.landed_at is not None:
@@ -171,6 +179,8 @@ def _find_true_end(
         )
     if isinstance(truth_end, TrueEnd):
         return truth_end
+    if is_assessed:
+        return WITHHELD
     flight = segment.flight
     if (
         max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)
@@ -266,6 +276,8 @@ def analyse_flight_loop(
 
     The result is Unavailable without odometry, or if the odometry does not end near its start.
     """
+    if flight.log.is_assessed:
+        return WITHHELD
     odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")

@@ -203,6 +203,8 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     references : tuple of Trajectory
     original_frame : Frame
         Frame of the trajectory before the conversion to z down.
+    is_assessed : bool
+        True if the flight is an assignment, so that its findings are withheld.
     """
 
     schema_type = LoopResult
@@ -211,6 +213,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     graph: PoseGraph | Unavailable
     references: tuple[Trajectory, ...]
     original_frame: Frame
+    is_assessed: bool = False
 
     __repr__ = one_line_repr
 

@@ -15,6 +15,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, read_head
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
+from px4fuse.flight.log import WITHHELD
 from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
@@ -68,6 +69,8 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     MissingDataError
         The log does not contain the track. The message contains an action to log it.
     """
+    if track_name == "truth" and flight.log.is_assessed:
+        raise MissingDataError(f"{flight.log.name}:truth: {WITHHELD.reason}", WITHHELD.remedy)
     if track_name == "kf":
         return _make_kf_trajectory(flight)
     track_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[

@@ -10,6 +10,7 @@ import io
 import struct
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from types import MappingProxyType
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec import UNSET
 from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
@@ -45,6 +47,10 @@ MAX_OUTSIDE_S = 2.0
 RELEASE_TYPE = 255
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
+# Key of the information that a simulated log is an assignment for a student
+ASSESSED_KEY = "px4fuse_assessed"
+# True while the instructor's commands read logs: the diagnosis of an assignment is not withheld
+ignores_assessed = ContextVar("ignores_assessed", default=False)
 # Maximum interval (s) between IMU timestamps of one flight: samples after a longer interval are
 # from another boot
 MAX_DATA_GAP_S = 600.0
@@ -466,6 +472,9 @@ def read_topics(name: str, content: bytes) -> Topics:
         bytes_read=source.start - source.skipped_bytes,
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
+        is_assessed=True
+        if ASSESSED_KEY in ulog.msg_info_dict and not ignores_assessed.get()
+        else UNSET,
     )
     parameters = {
         name: value for name, value in parameter_values.items() if name.startswith("EKF2_")

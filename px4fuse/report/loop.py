@@ -267,6 +267,8 @@ def describe_closure_error(loop: Loop) -> str:
     """Format the closure error in m, in percent of the path length, and its heading error."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
+        if loop.is_assessed:
+            return f"none for a path of {loop.path_length_m:.1f} m: px4fuse withholds its diagnosis"
         return f"none: the path of {loop.path_length_m:.1f} m does not return to its start (--open)"
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "

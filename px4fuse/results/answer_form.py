@@ -4,18 +4,21 @@
 """
 
 import hashlib
+import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from string import Template
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, table
+from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -61,13 +64,63 @@ MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHO
 # Corrections of injected faults that a form can name, with the units of their values (empty: no
 # value)
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
-VERDICTS = ("consistent", "overconfident", "underconfident")
+# Verdict on a filter without innovations
+NOT_AVAILABLE = "not available"
+VERDICTS = ("consistent", "overconfident", "underconfident", NOT_AVAILABLE)
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
-VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
+VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
+RangeName = Literal["", "a", "b", "c", "d", "e"]
+NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
+# Accepted values of the fields that are not numbers, for messages
+ACCEPTED_VALUES = {
+    **dict.fromkeys(
+        ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
+    ),
+    "when": "whole flight, or from_s and until_s",
+    "ekf2_did": "a list of texts",
+    "predictions": "a letter from a to e in quotes",
+    "log_sha256": "the text of the empty form: make it again with px4fuse answers",
+    **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
+}
 # Answer to a question about a number: the number, a list of update numbers, or None (no answer)
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
+
+
+# Answers to a question with a prediction: the range that contains the value
+PREDICTION_RANGES: tuple[RangeName, ...] = ("a", "b", "c", "d", "e")
+MAX_PREDICTIONS = 10
+PREDICTIONS_HEAD = """
+# Predictions: numbers along the main axis, in reports with SIGMA_A 0.5 and SIGMA_Z 0.1, if the
+# flight were simulated again with one change. Give the letter of the range. A wrong letter costs a
+# quarter of the points of a right one.
+[predictions]
+"""
+
+
+class Prediction(Record, frozen=True):
+    """Question on a number of another simulation of the flight, which no output contains.
+
+    Attributes
+    ----------
+    quantity : str
+        Predicted number, with the change of the simulation.
+    limits : tuple of float
+        Limits between the five ranges, ascending.
+    """
+
+    quantity: str
+    limits: tuple[float, float, float, float]
+
+    @property
+    def text(self) -> str:
+        """Question and ranges as the answer form prints them."""
+        first, *_, last = numbers = [f"{limit:.3g}" for limit in self.limits]
+        between = [f"{low} to {high}" for low, high in pairwise(numbers)]
+        texts = (f"below {first}", *between, f"above {last}")
+        ranges = ", ".join(map(": ".join, zip(PREDICTION_RANGES, texts, strict=True)))
+        return f"{self.quantity}; {ranges}"
 
 
 class StudentMistake(Record, frozen=True):
@@ -129,6 +182,8 @@ class Answers(Record, frozen=True, kw_only=True):
         Behaviour of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
         Answers to :func:`draw_questions`; a tuple lists update numbers.
+    predictions : tuple of str
+        Ranges that the student chose for each :class:`Prediction`; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -137,6 +192,7 @@ class Answers(Record, frozen=True, kw_only=True):
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
     quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
+    predictions: Annotated[tuple[RangeName, ...], Meta(max_length=MAX_PREDICTIONS)] = ()
 
     @property
     def names_no_mistake(self) -> bool:
@@ -203,7 +259,7 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     settings = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    limits = (1.0, 4.0) if third_kind == "prediction" else (1.3, 2.0)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
     duration_or_gate = draw_between(*limits, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *settings),
@@ -223,12 +279,38 @@ def read_answers(path: Path) -> Answers:
     text = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
     if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
+    record: dict[str, Any] = {}
     try:
-        answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
+        record = _as_record(tomllib.loads(text))
+        answers = msgspec.convert(record, Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct the answer form.") from error
+        message = _describe_error(error, text, record)
+        raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
+
+
+def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
+    """Name the field, its value and the accepted values, or the line that is not TOML."""
+    message = str(error)
+    if line := re.search(r"\(at line (\d+), column \d+\)", message):
+        content = one_line(text.splitlines()[int(line[1]) - 1], 60)
+        return f"line {line[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
+    reason, _, path = message.partition(" - at `$.")
+    names = re.findall(r"\w+", path)
+    if not names:
+        return message
+    value: Any = record
+    for name in names:
+        value = value[int(name) if name.isdigit() else name]
+    field, number = names[-1], int(names[1]) + 1 if len(names) > 1 else 0
+    if isinstance(value, dict):
+        return f"mistake {number}: {reason}"
+    accepted = ACCEPTED_VALUES.get(names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
+    if names[0] in ("quantities", "predictions"):
+        field = f"{names[0][0]}{number}"
+    place = f" of mistake {number}" if names[0] == "mistakes" else ""
+    return f"{field}{place} is {one_line(str(value), 60)!r}; give {accepted}"
 
 
 def _as_record(form: dict[str, Any]) -> dict[str, Any]:
@@ -236,7 +318,12 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     mistakes = filled_form.pop("mistake", ())
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
-    if unknown_fields := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
+    predictions = msgspec.convert(filled_form.pop("predictions", {}), dict[str, Any])
+    prediction_names = [f"p{number}" for number in range(1, MAX_PREDICTIONS + 1)]
+    if unknown_fields := sorted(
+        {*quantities, *({"mistakes"} & filled_form.keys())} - set(names)
+        | predictions.keys() - set(prediction_names)
+    ):
         raise ValueError(
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, {', '.join(names)}"
         )
@@ -244,6 +331,9 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(quantities.get(name) for name in names),
+        "predictions": tuple(predictions.get(name, "") for name in prediction_names)
+        if predictions
+        else (),
     }
 
 
@@ -314,8 +404,11 @@ def form_name(log_name: str) -> str:
     return f"{Path(log_name).stem}.answers.toml"
 
 
-def form_text(log_name: str, log_sha256: str) -> str:
-    """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
+def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] = ()) -> str:
+    """Return an empty answer form (TOML) for a log; its comments list all allowed answers.
+
+    ``predictions``: questions of the answer key, for an assigned flight.
+    """
     template = Template(
         files("px4fuse.results").joinpath("answer_form.toml").read_text(encoding="utf-8")
     )
@@ -337,6 +430,9 @@ def form_text(log_name: str, log_sha256: str) -> str:
         corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
         panels=_format_block(_format_in_threes(PANELS)),
         questions="\n".join(questions),
+    ) + "".join(
+        f'{PREDICTIONS_HEAD * (number == 1)}# {prediction.text}\np{number} = ""\n'
+        for number, prediction in enumerate(predictions, start=1)
     )
 
 
@@ -364,6 +460,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
+    for number, name in enumerate(answers.predictions, start=1):
+        if name:
+            yield f"Prediction p{number}", name
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

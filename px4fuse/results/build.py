@@ -23,6 +23,7 @@ from px4fuse.request import (
     command_line,
 )
 from px4fuse.results import contract
+from px4fuse.results.answer_form import EMPTY_CELL, Answers, form_rows
 from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
@@ -50,13 +51,21 @@ _COPIED_FIELDS = (
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
-    """Return the results of ``px4fuse compare`` on a flight with positions for KF."""
+    """Return the results of ``px4fuse compare`` on a flight with positions for KF.
+
+    On a flight that is an assignment, the card contains the student's answers.
+    """
+    card = build_card(analysis, request.without_paths(), (student.name, student.id))
+    if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
+        rows = form_rows(student.answers)
+        texts = (f"{label}: {text}" for label, text in rows if text != EMPTY_CELL)
+        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
     return within_bounds(
         contract.ComparisonResults(
             **_flight_fields(contract.COMPARISON_SCHEMA, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            card=build_card(analysis, request.without_paths(), (student.name, student.id)),
+            card=card,
             student=student,
         )
     )

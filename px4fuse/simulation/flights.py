@@ -12,7 +12,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
-from px4fuse.readers.ulog_topics import NOTE_KEY
+from px4fuse.readers.ulog_topics import ASSESSED_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake
@@ -121,13 +121,17 @@ def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Fli
     return to_flight(simulate(scenario, mistakes))
 
 
-def to_ulog(simulation: Simulation) -> bytes:
-    """Encode the flight as a ULog file, which contains no information about the injected faults."""
+def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
+    """Encode the flight as a ULog file, which contains no information about the injected faults.
+
+    ``is_assessed`` marks the log as an assignment, for which px4fuse withholds its diagnosis.
+    """
     info: dict[str, int | str] = {
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
         "ver_sw_release": PX4_RELEASE,
         **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
+        **({ASSESSED_KEY: 1} if is_assessed else {}),
     }
     return encode(simulation.topics, simulation.parameters, info, sensors.START_US)
 

@@ -24,8 +24,11 @@ from px4fuse.classroom.grading.form_points import form_points, panels, right_cor
 from px4fuse.results.answer_form import (
     CORRECTIONS,
     EKF2_BEHAVIOURS,
+    MAX_PREDICTIONS,
     MISTAKES,
+    NOT_AVAILABLE,
     PANELS,
+    PREDICTION_RANGES,
     VERDICTS,
     Answers,
     StudentMistake,
@@ -42,6 +45,11 @@ def truth(number: int) -> FormTruth:
     _, answer = simulate_assigned(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form
+
+
+def guess_predictions(rng: np.random.Generator) -> tuple[str, ...]:
+    """Return random ranges for all predictions."""
+    return tuple(rng.choice(PREDICTION_RANGES, MAX_PREDICTIONS).tolist())
 
 
 def at_random(rng: np.random.Generator) -> Answers:
@@ -63,6 +71,7 @@ def at_random(rng: np.random.Generator) -> Answers:
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
+        predictions=guess_predictions(rng),
     )
 
 
@@ -78,6 +87,10 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
         verdict_kf=common([one.kf.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
+        predictions=tuple(
+            common([one.predictions[index][1] for one in truths if len(one.predictions) > index])
+            for index in range(max(len(one.predictions) for one in truths))
+        ),
     )
     if kind == "none":
         yield blank
@@ -114,9 +127,10 @@ def right(one: FormTruth) -> Answers:
         log_sha256=SHA256,
         mistakes=tuple(claims) or (StudentMistake("none"),),
         verdict_kf=one.kf.verdict,  # type: ignore[arg-type]
-        verdict_ekf2=one.ekf2.verdict,  # type: ignore[arg-type]
+        verdict_ekf2=one.ekf2.verdict or NOT_AVAILABLE,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
         quantities=one.quantities,
+        predictions=tuple(name for _, name in one.predictions),
     )
 
 

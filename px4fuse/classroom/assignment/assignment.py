@@ -4,12 +4,21 @@ import hashlib
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key
-from px4fuse.classroom.assignment.random_assignment import AssignedFlight, FlightKind, draw
+from px4fuse.classroom.assignment.random_assignment import (
+    AssignedFlight,
+    FlightKind,
+    derive_key,
+    draw,
+    draw_uniform,
+)
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.classroom.assignment.truth import draw_predictions, form_truth
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
@@ -36,9 +45,13 @@ def simulate_assigned(
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
-    log = flights.to_ulog(simulation)
+    log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]
+    draw_number = partial(draw_uniform, secret, student.student_id, kind)
+    form = replace(
+        form_truth(simulation, sha256), predictions=draw_predictions(simulation, draw_number)
+    )
     return log, Answer(
         student_id=student.student_id,
         name=student.name,
@@ -48,7 +61,7 @@ def simulate_assigned(
         mistakes=assigned_flight.mistake_options,
         truth={name: float(true_values[name]) for name in TRUTH_NAMES},
         difficulty=assigned_flight.difficulty,
-        form=form_truth(simulation, sha256),
+        form=form,
     )
 
 
@@ -115,20 +128,27 @@ def assign(
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     _check_extends(
         key_file,
-        key.kind == kind and answers.keys() <= {normalise_text(s.student_id) for s in students},
+        # students may have left the class, but the key of another class has no common student
+        key.kind == kind
+        and (
+            not answers
+            or not answers.keys().isdisjoint(normalise_text(s.student_id) for s in students)
+        ),
     )
     new_secret = key.secret
     if secret is None:
         new_secret = new_secret or secrets.token_urlsafe(24)
-        secret = new_secret.encode()
-    elif new_secret.encode() != secret:
+        secret = derive_key(new_secret)
+    elif derive_key(new_secret) != secret:
         new_secret = ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
         log, answer = simulate_assigned(secret, student, kind, count, truth)
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _check_extends(key_file, stored_answer.sha256 == answer.sha256)
-        form = form_text(student.file, answer.sha256).encode()
+        predictions = stored_answer.form.predictions if stored_answer.form else ()
+        questions = [question for question, _ in predictions]
+        form = form_text(student.file, answer.sha256, questions).encode()
         contents = {folder / student.file: log, folder / form_name(student.file): form}
         missing_contents = {
             path: content for path, content in contents.items() if not _is_written(path, content)
@@ -164,7 +184,7 @@ def preview(
                 "--preview requires --secret-file: --preview stores no secret, so the next run "
                 "would draw other flights."
             )
-        secret = stored_key.secret.encode()
+        secret = derive_key(stored_key.secret)
     return [draw(secret, student.student_id, kind, count) for student in students]
 
 

@@ -24,7 +24,7 @@ from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
 FlightKind = Literal["aisle", "loop", "mixed"]
 
 # Minimum length (characters) of the instructor's secret: a shorter one can be guessed
-MIN_SECRET_LENGTH = 8
+MIN_SECRET_LENGTH = 16
 # First part of each HMAC message. Another label would change all flights, so that students could
 # not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
@@ -202,7 +202,9 @@ def draw(
 
 
 def encode_secret(text: str, where: str) -> bytes:
-    """Encode the instructor's secret as bytes; ``where`` names its option or file in errors.
+    """Derive the key of the random numbers from the instructor's secret by scrypt (RFC 7914).
+
+    scrypt makes each guess of the secret slow. ``where`` names the option or file in errors.
 
     Raises
     ------
@@ -216,4 +218,10 @@ def encode_secret(text: str, where: str) -> bytes:
             f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
             "generates one and stores it in the answer key.",
         )
-    return stripped.encode(errors="replace")
+    return derive_key(stripped)
+
+
+def derive_key(secret: str) -> bytes:
+    """Derive the key of the random numbers from a secret."""
+    text = secret.encode(errors="replace")
+    return hashlib.scrypt(text, salt=DRAW_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

@@ -1,7 +1,8 @@
 """Right answers to the answer form about a simulated flight."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,14 @@ from px4fuse.flight.model import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
-from px4fuse.results.answer_form import GATE_UPDATES, FormQuestion, draw_questions
+from px4fuse.results.answer_form import (
+    GATE_UPDATES,
+    PREDICTION_RANGES,
+    FormQuestion,
+    Prediction,
+    RangeName,
+    draw_questions,
+)
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
@@ -39,6 +47,8 @@ MIN_REJECTED_FRACTION = 0.005
 MIN_RESET_M = 0.2
 # Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
 EKF2_START_S = 5.0
+# Ratio of both ends of a range of an answer
+PREDICTION_RANGE_FACTOR = 1.35
 # Injected faults that require or allow an answer about the behaviour of EKF2, by rule and answer
 BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
@@ -91,6 +101,8 @@ class FormTruth(Record, frozen=True):
     quantities : tuple
         Answers to :func:`px4fuse.results.answer_form.draw_questions`; None if the flight is too
         short.
+    predictions : tuple of (Prediction, str)
+        Questions on other simulations of the flight, with the right range.
     """
 
     mistakes: tuple[TrueMistake, ...]
@@ -100,15 +112,13 @@ class FormTruth(Record, frozen=True):
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
+    predictions: tuple[tuple[Prediction, RangeName], ...] = ()
 
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """Compute the right answers from a simulation and its analysis with default settings."""
     answer = flights.answer(simulation)
-    flight = flights.to_flight(simulation)
-    request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
-    prepared = prepare(flight, request)
-    comparison = compare(prepared, run_kf(prepared))
+    comparison = _compare(simulation)
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
@@ -122,6 +132,59 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
         *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
         tuple(quantity_truth(comparison.main, question) for question in draw_questions(log_sha256)),
     )
+
+
+def _compare(simulation: flights.Simulation) -> Comparison:
+    flight = flights.to_flight(simulation)
+    prepared = prepare(flight, ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M))
+    return compare(prepared, run_kf(prepared))
+
+
+def draw_predictions(
+    simulation: flights.Simulation, draw_number: Callable[[str], float]
+) -> tuple[tuple[Prediction, RangeName], ...]:
+    """Draw questions on other simulations of the flight, with the right ranges.
+
+    The simulations need the seed of the flight, which only the instructor has. The position of the
+    right range is random, so that the ranges do not show the value.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    draw_number : callable
+        Function that returns a random number in [0, 1) for a label.
+    """
+    scenario = replace(simulation.scenario, truth=True)
+    noise_name = "sigma_vio_m" if scenario.kind == "loop" else "sigma_uwb_m"
+    noisy = replace(scenario, **{noise_name: 2.0 * getattr(scenario, noise_name)})
+    variants = {
+        "if the flight had no faults": flights.simulate(scenario),
+        "if the position noise (1 σ) were twice as large": flights.simulate(
+            noisy, simulation.mistakes
+        ),
+    }
+    predictions: list[tuple[Prediction, RangeName]] = []
+    for change, variant in variants.items():
+        for name, summary in _compare(variant).main.filters.items():
+            truth = summary.truth
+            values = {
+                "mean NIS": None if isinstance(summary, Unavailable) else summary.nis_mean,
+                "position RMSE against ground truth (m)": None
+                if isinstance(truth, Unavailable)
+                else truth.position_rmse_m,
+            }
+            for quantity, value in values.items():
+                if value is None or not value > 0.0:
+                    continue
+                text = f"{quantity} of {name.upper()} {change}"
+                right = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
+                place = right - 0.2 - 0.6 * draw_number(f"place {text}")
+                first, second, third, fourth = (
+                    value * PREDICTION_RANGE_FACTOR ** (index - place) for index in range(4)
+                )
+                limits = (first, second, third, fourth)
+                predictions.append((Prediction(text, limits), PREDICTION_RANGES[right]))
+    return tuple(predictions)
 
 
 def _true_mistake(
@@ -186,6 +249,8 @@ def _ekf2_behaviour(
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large and reset.time_s > since_s:
             required.append("dead-reckoned, then reset")
+    if "never fused" in required:  # EKF2 cannot follow positions that it does not fuse
+        required, allowed = ["never fused"], [*required, *allowed]
     if not required:
         required, allowed = ["normal"], ["followed the positions", *allowed]
     required = [*dict.fromkeys(required)]

@@ -37,6 +37,7 @@ from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE_LENGTH = 160
+OTHER_FORM_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
 # Regular expression of one character that is not a control character
 _PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
@@ -154,9 +155,13 @@ class CheckInput:
             check_answers(answers)
         except ValueError as error:
             return f"your answer form cannot be read ({shorten_text(str(error))})"
-        if answers.log_sha256 != log_sha256(self.results):
-            return "your answer form and your report are about different logs"
-        return answers
+        return OTHER_FORM_REASON if self.has_form_of_other_log else answers
+
+    @property
+    def has_form_of_other_log(self) -> bool:
+        """True if the answer form in the report was made for another log."""
+        answers = self.results.student.answers
+        return isinstance(answers, Answers) and answers.log_sha256 != log_sha256(self.results)
 
     @cached_property
     def form_points(self) -> FormPoints | str:

@@ -49,6 +49,8 @@ _LATE_RULE = re.compile(
 )
 # Formats of submission times in Moodle's worksheets (English), with a 12-hour and a 24-hour clock
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
+# Beginnings of the German names of months in these times, January first
+GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep", "okt", "nov", "dez")
 
 
 @dataclass(frozen=True)
@@ -188,6 +190,13 @@ def build_entries(
     rows += [replace(row, flags=(flag, *row.flags)) for *_, row in attempts[None]]
     overrides_by_row, notes = match_overrides(overrides, rows)
     flags = flag_equal_contents([row.counted_report for row in rows if row.counted_report])
+    submitted_rows = [row for row in rows if row.counted_report]
+    unknown_count = sum(row.late_s is None for row in submitted_rows)
+    if course.late_rule and unknown_count:
+        notes += (
+            f"The submission time is unknown for {unknown_count} of {len(submitted_rows)} "
+            "students, so no points were deducted. Add the times with --worksheet.",
+        )
     final_rows = (
         _apply_overrides(*row_and_overrides, flags, course)
         for row_and_overrides in zip(rows, overrides_by_row, strict=True)
@@ -298,6 +307,8 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
+    elif course.attempt == "best" and len({report.form for _, report, _ in with_report}) > 1:
+        flags.append(f"The student handed in {len(ordered)} reports with different answer forms.")
     elif len(forms) > 1 and any(chosen_key):
         flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
     for sort_key, report, _ in ordered:
@@ -377,6 +388,11 @@ def read_overrides(path: Path) -> Overrides:
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
+        if any(cell.strip() for cell in row[len(sheet.head) :]):
+            raise SettingsError(
+                f"{path}: row {row_number} has more cells than the header.",
+                "Put a comment that contains a comma in double quotes.",
+            )
         student, item_title, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
@@ -503,8 +519,18 @@ def parse_moodle_time(text: str) -> datetime | None:
 
     >>> parse_moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
     '2026-11-20T23:58:00'
+    >>> parse_moodle_time("Freitag, 20. November 2026, 23:58").isoformat()
+    '2026-11-20T23:58:00'
+    >>> parse_moodle_time("2026-11-20 23:58").isoformat()
+    '2026-11-20T23:58:00'
     >>> parse_moodle_time("-")
     """
+    if german := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
+        day, month, year, clock = german.groups()
+        if (name := month.casefold()[:3]) in GERMAN_MONTHS:
+            text = f"{year}-{GERMAN_MONTHS.index(name) + 1:02}-{day:>02} {clock:>05}"
+    with suppress(ValueError):
+        return datetime.fromisoformat(text.strip())
     for time_format in _MOODLE_FORMATS:
         with suppress(ValueError):
             return datetime.strptime(text.strip(), time_format)

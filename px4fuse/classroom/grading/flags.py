@@ -100,6 +100,12 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
         for name in ("size", "value")
     }
     answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
+    # a list of update numbers, which must be equal in all digits
+    answers |= {
+        (f"q{index}", "value"): float("".join(f"{number:.0f}" for number in numbers))
+        for index, numbers in enumerate(report.form.quantities)
+        if isinstance(numbers, tuple) and numbers
+    }
     return {key: float(n) for key, n in answers.items() if isinstance(n, float | int)}
 
 

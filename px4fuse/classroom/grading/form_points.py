@@ -17,11 +17,16 @@ from px4fuse.core.record import table
 from px4fuse.results.answer_form import (
     MISTAKES,
     NO_MISTAKE_KIND,
+    NOT_AVAILABLE,
+    PREDICTION_RANGES,
     Answers,
     QuantityAnswer,
     StudentMistake,
 )
 
+# Fraction of the points for the diagnosis if the answer key has predictions: the diagnosis can be
+# copied from px4fuse, the predictions from no output
+DIAGNOSIS_SHARE = 0.2
 # Points deducted for each false fault: named in the answer form, but not in the flight
 FALSE_MISTAKE_POINTS = 10.0
 # Minimum number of false faults for which a form gets no points for right faults either
@@ -32,8 +37,10 @@ NEIGHBOUR_FRACTION = 0.4
 SAME_NUMBER_FRACTION = 2.0 / 3.0
 # Fraction of the points if the answer form names a consequence of the injected fault
 EFFECT_FRACTION = 0.15
-# Injected faults that can be guessed without a measurement: only the correct size has points. A
-# nearly correct size has no points, because the assigned sizes are close to each other
+# Relative error beyond the tolerance at which the size of a guessable fault has no points
+GUESSABLE_SIZE_RANGE = 0.08
+# Injected faults that can be guessed without a measurement: only a size that is nearly correct has
+# points, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
 # Tolerance (s) of start and end of an injected fault
@@ -117,9 +124,19 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
+    if truth.predictions:
+        weights = {name: DIAGNOSIS_SHARE * points for name, points in weights.items()}
+        weights["predictions"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
+        points_by_part = {name: DIAGNOSIS_SHARE * each for name, each in points_by_part.items()}
+        points_by_part["predictions"] = weights["predictions"] * _prediction_fraction(
+            answers, truth
+        )
     named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
-    feedback = tuple(_mistake_feedback(matches, false_mistakes, is_clean_named))
+    feedback = (
+        *_mistake_feedback(matches, false_mistakes, is_clean_named),
+        *_prediction_feedback(answers, truth),
+    )
     return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
 
 
@@ -136,15 +153,39 @@ def _mistake_feedback(
         yield f"your flight has no injected fault{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
+        right_answer = _describe_right_answer(mistake)
         if student_mistake is None:
-            yield f"you did not name {mistake_text}"
+            yield f"you did not name {mistake_text}: {right_answer}"
         elif student_mistake.kind != mistake.kind:
-            yield f"you named {student_mistake.kind} instead of {mistake_text}"
+            yield f"you named {student_mistake.kind} instead of {mistake_text}: {right_answer}"
         else:
-            yield f"you named {mistake.kind}, which is right"
+            yield f"you named {mistake.kind}, which is right: {right_answer}"
     if false_mistakes:
         kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
         yield f"you named faults that your flight does not have: {kinds}"
+
+
+def _describe_right_answer(mistake: TrueMistake) -> str:
+    """State the accepted size, the time and the panels of the report that show the fault."""
+    texts = []
+    if mistake.low is not None and mistake.high is not None:
+        unit = next(iter(MISTAKES[mistake.kind].units), "")
+        texts.append(f"accepted size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
+    starts = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
+    ends = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
+    texts.append(f"{starts}{ends}".strip() or "whole flight")
+    return ", ".join([*texts, f"shown in {' or '.join(panels(mistake.kind))}"])
+
+
+def _prediction_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
+    """Yield a clause with the right range for each prediction that is wrong or missing."""
+    given = dict(enumerate(answers.predictions))
+    for index, (question, right) in enumerate(truth.predictions):
+        if given.get(index) != right:
+            yield (
+                f"p{index + 1}, {question.quantity}: range {right} is right, you gave "
+                f"{given.get(index) or 'none'}"
+            )
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
@@ -217,8 +258,11 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
         first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
         is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
         return is_right / 3.0
-    is_close = abs(size - mistake.size) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
-    close_fraction = 0.5 * (is_close and mistake.kind not in GUESSABLE_KINDS)
+    deviation = abs(size - mistake.size) / abs(mistake.size)
+    close_fraction = 0.5 * (deviation <= HALF_SIZE_TOLERANCE)
+    if mistake.kind in GUESSABLE_KINDS:  # decreases from 1 at the tolerance
+        tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
+        close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
     return _value_fraction(size, mistake.low, mistake.high, close_fraction)
 
 
@@ -299,7 +343,7 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
 def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
     """Return the fraction of the points for the verdicts on KF and EKF2, and EKF2's behaviour."""
     pairs = (answers.verdict_kf, truth.kf.verdict), (answers.verdict_ekf2, truth.ekf2.verdict)
-    right_count = sum(bool(answer) and answer == right for answer, right in pairs)
+    right_count = sum(answer == (right or NOT_AVAILABLE) for answer, right in pairs)
     return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
 
 
@@ -319,6 +363,17 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
     return 1.0 if is_complete and not false_count else 0.5
 
 
+def _prediction_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for predictions; guesses have no points on average."""
+    given = dict(enumerate(answers.predictions))
+    guessed_points = -1.0 / (len(PREDICTION_RANGES) - 1)
+    points = [
+        0.0 if not given.get(index) else 1.0 if given[index] == right else guessed_points
+        for index, (_, right) in enumerate(truth.predictions)
+    ]
+    return max(sum(points) / len(points), 0.0)
+
+
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
     """Return the fraction of the points for the numbers of KF that the student computed."""
     # an empty list of updates is the right answer on most flights, so it has no points
@@ -328,7 +383,8 @@ def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
-    if isinstance(answer, tuple) and isinstance(true_value, tuple):
+    if isinstance(true_value, tuple) and answer is not None:
+        answer = answer if isinstance(answer, tuple) else (answer,)
         difference_count = len(set(answer) ^ set(true_value))
         has_right_number = not set(answer).isdisjoint(true_value)
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number

@@ -154,6 +154,14 @@ class GradedReport:
         return any(item.awaits_points for item in self.items)
 
     @property
+    def pending_reason(self) -> str:
+        """Action of the instructor before the points count; "" if they count."""
+        titles = [item.title for item in self.items if item.awaits_points]
+        return " ".join(
+            [self.instructor_action, *(f"Enter the points of {t}." for t in titles)]
+        ).strip()
+
+    @property
     def max_points(self) -> float:
         """Sum of the maximum points of all items."""
         return sum(item.max_points for item in self.items)

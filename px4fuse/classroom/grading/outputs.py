@@ -39,7 +39,7 @@ from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import html_text
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
-from px4fuse.classroom.grading.records import RECORDS_FOLDER, REDRAWN_SUFFIX
+from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.core.text import join_first, one_line
@@ -151,11 +151,14 @@ def _entry_identity(entry: Entry, stem: bool = False) -> str:
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy a redrawn report to the folder ``reports``, and add its path to the row."""
+    """Copy a redrawn report to ``reports`` and its diagnosis to ``feedback``; add the path."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
-    redrawn_file = output / RECORDS_FOLDER / f"{report.sha256}{REDRAWN_SUFFIX}"
+    record = output / RECORDS_FOLDER / report.sha256
+    redrawn_file, diagnosis = map(record.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
+    if diagnosis.exists():
+        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis.read_bytes()})
     if not redrawn_file.exists():
         return entry
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
@@ -254,7 +257,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
             *(report.numbers.get(title) if report else None for title in numbers),
             entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
-            report.instructor_action if report else "",
+            report.pending_reason if report else "",
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
             LIST_SEPARATOR.join(other.submission for other in entry.other_reports),

@@ -12,20 +12,24 @@ from functools import cache
 from pathlib import Path
 
 import msgspec
+from msgspec import structs
 
 from px4fuse.core.writing import write_all
 from px4fuse.errors import ResultsError
+from px4fuse.readers.ulog_topics import ignores_assessed
 from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import log_sha256, verify
+from px4fuse.verification.verification import log_sha256, recompute, verify
 
 # Subfolder of the output folder for stored verifications
 RECORDS_FOLDER = "records"
 # Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
+# Suffix of a report with px4fuse's diagnosis, which the report of an assignment withholds
+DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ def load_or_verify(
     Returns
     -------
     results : ComparisonResults or LoopResults
-        Results attached to the PDF.
+        Results attached to the PDF; for a verified report on an assigned log, the results with
+        px4fuse's diagnosis.
     verdict : Verdict
         Result of the verification.
     is_loaded : bool
@@ -82,15 +87,31 @@ def load_or_verify(
     if loaded := _load_record(records, sha256, logs, assigned_hashes):
         return *loaded, True
     results = read_report(pdf, "The file")
-    attached = to_json(results)
-    dependencies = _dependencies(attached, logs, assigned_hashes)
+    dependencies = _dependencies(to_json(results), logs, assigned_hashes)
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verdict = verify(results, pdf, {} if is_log_missing else logs)
     files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
+    if verdict.status == "verified" and log_sha256(results) in assigned_hashes:
+        results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, logs)
     stored_verdict = replace(verdict, redrawn=b"")
-    record = VerificationRecord(dependencies, attached, stored_verdict)
+    record = VerificationRecord(dependencies, to_json(results), stored_verdict)
     _write_record(records, sha256, record, files)
     return results, stored_verdict, False
+
+
+def diagnose_assigned(
+    results: ReportedResults, logs: Mapping[str, Path]
+) -> tuple[ReportedResults, bytes]:
+    """Repeat a verified analysis with px4fuse's diagnosis; return results and report."""
+    token = ignores_assessed.set(True)
+    try:
+        outcome = recompute(results, logs)
+    finally:
+        ignores_assessed.reset(token)
+    if isinstance(outcome, Verdict):
+        raise ResultsError(f"The diagnosis for the feedback failed: {'; '.join(outcome.reasons)}.")
+    diagnosed_results, draw = outcome
+    return structs.replace(diagnosed_results, provenance=results.provenance), draw()
 
 
 def _dependencies(

@@ -18,6 +18,7 @@ from msgspec import Meta
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.roster import make_unique
 from px4fuse.classroom.grading.checks import (
+    OTHER_FORM_REASON,
     CheckInput,
     RubricItem,
     Text,
@@ -130,6 +131,10 @@ def _describe_place(path: re.Match[str]) -> str:
 
 # ------------------------------------------------------------------ points
 
+OTHER_FORM_ADVICE = (
+    "The answer form was made for another log. Ask for a report with the right form."
+)
+
 
 def score_report(
     results: ReportedResults,
@@ -170,6 +175,7 @@ def score_report(
             *flag_pages(verdict),
             *flag_settings(results, key is not None),
             *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
+            *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=rule_text if points_rule == "pending" else "",
         mistakes={}
@@ -200,6 +206,8 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
     if not check_input.is_own_log:
         reason_text = "your report is not about the log that you were given"
         problems.append((rubric.others_log, reason_text, _foreign_log_advice(check_input)))
+    if check_input.has_form_of_other_log:
+        problems.append(("pending", OTHER_FORM_REASON, OTHER_FORM_ADVICE))
     if check_input.key is not None and getattr(check_input.results.request, "position", None):
         action = (
             "Ask for the origin of the position file (--position): the assignment contains no "

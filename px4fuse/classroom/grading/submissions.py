@@ -37,7 +37,7 @@ from px4fuse.classroom.grading.model import UNKNOWN_SUBMITTER, ExportOrigin, Sub
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import files_below
 from px4fuse.core.record import table
-from px4fuse.core.text import clean_text, one_line
+from px4fuse.core.text import clean_text, join_first, one_line
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
@@ -62,6 +62,8 @@ _TOO_LARGE_REASON = (
 # General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
 _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
+# Maximum number of ignored files that a note names
+MAX_LISTED_FILES = 5
 GRADESCOPE_METADATA = "submission_metadata.yml"
 # Pattern of the file paths in an export, by learning platform
 PLATFORMS = {
@@ -119,7 +121,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     notes: list[str] = []
     submission_by_path: dict[tuple[Path, str], Submission] = {}
     origin_by_number: dict[str, ExportOrigin] = {}
-    other_count = zip_count = 0
+    other_names, zip_count = list[str](), 0
     for path in paths:
         is_export = path.is_file() and path.name.lower().endswith(".zip")
         for submission in (_zip_submissions if is_export else _folder_submissions)(path, notes):
@@ -129,15 +131,16 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
                 submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
                 zip_count += suffix == ".zip"
             elif not _is_metadata(submission.name):
-                other_count += 1
+                other_names.append(_short_name(submission.name))
             else:
                 try:
                     text = read(submission).decode("utf-8", errors="replace")
                     origin_by_number |= read_gradescope_metadata(text)
                 except ResultsError as error:
                     notes.append(str(error))
-    if other_count:
-        notes.append(f"Ignored files (not PDF): {other_count}.")
+    if other_names:
+        names_text = join_first(other_names, MAX_LISTED_FILES)
+        notes.append(f"Ignored files (not PDF): {len(other_names)} ({names_text}).")
     if zip_count:
         notes.append(
             f"Zip files not opened: {zip_count}. Name each exported zip file on the command line."
@@ -244,10 +247,12 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
         notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
         return []
     last_by_name = {entry.filename: entry for entry in entries}
-    if duplicate_count := len(entries) - len(last_by_name):
-        notes.append(
-            f"{_short_name(path.name)}: {duplicate_count} entries have duplicate names; "
-            "only the last entry of each name was read."
+    if len(entries) > len(last_by_name):
+        (name, _), *_ = Counter(entry.filename for entry in entries).most_common(1)
+        raise SettingsError(
+            f"{_short_name(path.name)} contains two files with the name {_short_name(name)}: a "
+            "student may have added one of them.",
+            "Export the submissions again.",
         )
     submissions = (
         Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))

@@ -1,0 +1,135 @@
+"""Assignments: px4fuse withholds its diagnosis from students, and shows it to the instructor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from cli_tools import error_line, run, run_checked
+from exchange import replace
+from form_guesses import right
+
+from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.roster import Person
+from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
+from px4fuse.classroom.grading.records import load_or_verify
+from px4fuse.classroom.grading.rubric import read_rubric, score_report
+from px4fuse.core.reading import files_by_sha256
+from px4fuse.flight.log import WITHHELD
+from px4fuse.readers.ulog_topics import ASSESSED_KEY
+from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
+from px4fuse.results.contract import ComparisonResults, to_json
+from px4fuse.results.reading import read_results
+from px4fuse.verification.model import Verdict
+
+SECRET = b"a secret for tests"
+
+
+class Assigned(NamedTuple):
+    """Assigned log with an answer form, the student's report, and its results."""
+
+    log: Path
+    report: Path
+    results: ComparisonResults
+
+
+@pytest.fixture(scope="module")
+def assigned(tmp_path_factory: pytest.TempPathFactory) -> Assigned:
+    folder = tmp_path_factory.mktemp("assigned")
+    content, answer = simulate_assigned(SECRET, Person("s01"), "aisle", 2)
+    log, form, report = (folder / name for name in ("s01.ulg", "s01.toml", "s01.pdf"))
+    log.write_bytes(content)
+    text = form_text(log.name, answer.sha256)
+    form.write_text(text.replace('verdict_kf = ""', 'verdict_kf = "consistent"'))
+    run_checked("compare", log, "--answers", form, "-o", report)
+    results = read_results(report.with_suffix(".json").read_bytes())
+    assert isinstance(results, ComparisonResults)
+    return Assigned(log, report, results)
+
+
+def test_report_of_assignment_contains_answers_not_findings(assigned: Assigned) -> None:
+    results = assigned.results
+    assert results.log.is_assessed is True
+    assert (results.findings, results.trials, results.card.causes) == ((), (), ())
+    assert results.card.facts == {"Answers": "Verdict on KF: consistent"}
+    assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {WITHHELD}
+    assert results.axes["aisle"].updates.count > 100
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "tune {log}",
+        "sync {log}",
+        "whatif {log}",
+        "evaluate {log}:ekf2 {log}",
+        "compare {log} --clock-offset auto",
+    ],
+)
+def test_estimate_for_assignment_is_refused_in_one_line(assigned: Assigned, command: str) -> None:
+    assert WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
+
+
+def test_loop_of_assignment_has_no_closure(assigned: Assigned, tmp_path: Path) -> None:
+    run_checked("loop", assigned.log, "--json", tmp_path / "loop.json")
+    data = json.loads((tmp_path / "loop.json").read_text(encoding="utf-8"))
+    assert data["loop"]["true_end"]["reason"] == WITHHELD.reason
+    assert (data["loop"]["closures"], data["findings"]) == ([], [])
+
+
+def test_grade_adds_diagnosis_to_report_of_assignment(assigned: Assigned, tmp_path: Path) -> None:
+    logs, pdf = files_by_sha256([assigned.log]), assigned.report.read_bytes()
+    assigned_hashes = frozenset(logs)
+    results, verdict, _ = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
+    assert verdict.status == "verified"
+    assert results.findings
+    assert [*tmp_path.glob("*.diagnosis.pdf")]
+    again, _, is_loaded = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
+    assert is_loaded
+    assert to_json(again) == to_json(results)
+
+
+def test_report_of_log_without_mark_is_not_verified(assigned: Assigned, tmp_path: Path) -> None:
+    copy = tmp_path / assigned.log.name
+    key = ASSESSED_KEY.encode()
+    copy.write_bytes(assigned.log.read_bytes().replace(key, b"x" * len(key)))
+    run_checked("compare", copy, "-o", tmp_path / "copy.pdf")
+    assert json.loads((tmp_path / "copy.json").read_text(encoding="utf-8"))["findings"]
+    result = run("verify", tmp_path / "copy.pdf", assigned.log)
+    assert result.exit_code != 0
+    assert "other log" in result.stdout
+
+
+def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
+    _, answer = simulate_assigned(SECRET, Person("s1"), "aisle", 1)
+    assert answer.form is not None
+    predictions = answer.form.predictions
+    assert len(predictions) >= 6
+    for question, letter in predictions:
+        assert sorted(question.limits) == list(question.limits)
+        assert f"{letter}: " in question.text
+    assert len({letter for _, letter in predictions}) > 1
+
+
+def test_predictions_outweigh_a_diagnosis_without_evidence() -> None:
+    _, answer = simulate_assigned(SECRET, Person("s01"), "aisle", 2)
+    assert answer.form is not None
+    complete = right(answer.form)
+    assert form_points(complete, answer.form).fraction == pytest.approx(1.0)
+    copied = replace(complete, predictions=())
+    assert form_points(copied, answer.form).fraction == pytest.approx(DIAGNOSIS_SHARE)
+    for letter in PREDICTION_RANGES:
+        guessed = replace(complete, predictions=(letter,) * len(complete.predictions))
+        assert form_points(guessed, answer.form).fraction < 0.6
+
+
+def test_grade_flags_answer_form_of_other_log(assigned: Assigned) -> None:
+    student = assigned.results.student
+    other = replace(student, answers=replace(student.answers, log_sha256="0" * 64))
+    results = replace(assigned.results, student=other)
+    report = score_report(results, Verdict("verified", (), True), read_rubric(None), None)
+    assert report.counted_points is None
+    assert "made for another log" in report.pending_reason
+    assert report.pending_reason in report.flags
