@@ -170,7 +170,7 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
-    assert reason == "fused by EKF2; the only position in the log"
+    assert reason == "the only position source in the log, fused by EKF2"
     prepared = prepare(flight)
     assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
     # external vision is not reported as missing

@@ -48,7 +48,9 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(f"{name}: `system` is only for MAVLink recordings.")
+            raise SettingsError(
+                f"{name}: the file is a ULog, but `system` is only for MAVLink recordings."
+            )
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))

@@ -98,7 +98,7 @@ class PositionRecording:
     metres_per_unit : float
         Factor that was applied to the first position column.
     invalid : Series
-        Rows that are no measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
+        Rows without a measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
     step_m : float
         Rounding step of the coarsest horizontal coordinate; 0 if there is none.
     format : str
@@ -185,7 +185,7 @@ def read_position_file(
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
-            f"dropped rows without valid time or position: {unusable_count}"
+            f"number of dropped rows without valid time or position: {unusable_count}"
             f"{table.first_line(numbers.index[~is_usable])}"
         )
     empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
@@ -201,14 +201,15 @@ def read_position_file(
     kept_rows = _increasing_rows(seconds)
     if dropped := len(seconds) - len(kept_rows):
         notes.append(
-            f"dropped rows with timestamps that repeat, decrease or are after 2100: {dropped}"
+            "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
+            f"{dropped}"
         )
     is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_SHARE * row_count
     if is_not_time or len(kept_rows) < MIN_ROWS:
         raise LogError(
-            f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
-            f"needed{''.join('; ' + note for note in notes)}",
-            f"Use decimal points, or name the columns with {COLUMNS_OPTION}.",
+            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_ROWS}"
+            f"{''.join('; ' + note for note in notes)}",
+            f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
     median_interval_s = median_interval(numbers.index)
@@ -249,8 +250,8 @@ def read_position_file(
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
-            f"time: column {time_text}, {clock} clock, in {unit_text}",
-            f"position: columns {table.label(*position)} as {axes_text}, in {length_unit_text}",
+            f"time: column {time_text}, {clock} clock, unit {unit_text}",
+            f"position: columns {table.label(*position)} as {axes_text}, unit {length_unit_text}",
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
@@ -269,7 +270,9 @@ def _open_table(
     """Return the table of a file or bag, with SHA-256 and size (bytes)."""
     if is_bag(path):
         return read_bag(path, body)
-    content = read_bytes_limited(path, LogError, MAX_FILE_BYTES, empty_remedy="Copy it again")
+    content = read_bytes_limited(
+        path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
+    )
     refuse_foreign_format(path, content, LogError)
     table = find_table(path, content, columns, body)
     return table, hashlib.sha256(content).hexdigest(), len(content)
@@ -278,7 +281,7 @@ def _open_table(
 def _increasing_rows(seconds: Array) -> IntArray:
     """Return the indices of rows whose times increase and are before 2100."""
     usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # Ranks instead of times, because the function requires positive values
+    # Ranks are used instead of times, because longest_increasing_run requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[longest_increasing_run(ranks + 1)]
 
@@ -329,7 +332,7 @@ def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     count = int(is_not_positive.any(axis=1).sum())
-    return [f"ignored sigmas that are zero or negative: {count}"] if count else []
+    return [f"number of ignored sigmas that are zero or negative: {count}"] if count else []
 
 
 def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Series[float]":
@@ -385,11 +388,11 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; also return frame and time description.
+    """Choose the columns of time, position and sigma.
 
-    1. Columns that the user chose are used.
-    2. Otherwise the names determine the columns. A non-empty column with the time of measurement is
-       preferred to a column with the time of recording.
+    Also return the frame, and the description of the time column. Columns that the user chose are
+    used. Otherwise the column names determine the columns. A column with the time of measurement is
+    preferred to a column with the time of recording if it is not empty.
     """
     if chosen_columns:
         time = chosen_columns[0]
@@ -424,7 +427,7 @@ def _choose_columns(
                 other_times = [other for other in other_times if other != index]
                 time_text += f" plus {table.label(index)}"
         if other_times:
-            time_text += f", the {meanings[time].key} (not used: {table.label(*other_times)})"
+            time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
         frame, position = position_names.find_position(meanings) or (None, ())
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
@@ -443,7 +446,7 @@ def _time_unit(
     units: Container[str],
     intervals_s: tuple[float, float],
 ) -> tuple[str, str]:
-    """Return the unit of the time column and its description.
+    """Return the unit of the time column, and a text with the reason for this unit.
 
     Units other than ``units`` are for UNIX times only; ``intervals_s`` are the plausible median
     intervals.
@@ -459,18 +462,22 @@ def _time_unit(
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, f"{unit} (from the magnitude of UNIX time)"
+            return unit, f"{unit} (because the times are then UNIX times)"
         if unit in units and intervals_s[0] <= median_step * scale <= intervals_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s (assumed, because no unit gives a plausible UWB rate; "
-            "--position-time-unit sets another unit)"
+            "s (assumed, because no unit gives a plausible UWB rate; set another unit with "
+            "--position-time-unit)"
         )
     unit = plausible_units[0]
-    description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
+    description = (
+        f"{unit} (because the median interval is then {median_step * TIME_UNITS[unit]:.3g} s)"
+    )
     if plausible_units[1:]:
-        description += f"; if {plausible_units[1]}, give --position-time-unit"
+        description = (
+            f"{description}; if the unit is {plausible_units[1]}, give --position-time-unit"
+        )
     return unit, description
 
 
@@ -481,7 +488,7 @@ def _length_units(
     option: str | None,
     max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
-    """Return metres per unit of each column, and the description of the unit of the positions."""
+    """Return metres per unit of each column, and a text with the unit of the positions."""
     name_units = {
         index: meaning.unit
         for index, meaning in enumerate(meanings)
@@ -491,22 +498,25 @@ def _length_units(
     extents = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
-    reason = "assumed: the column names contain no unit"
+    reason = "assumed, because the column names contain no unit"
     if option is not None:
         unit = option
         name_units = {}
-        reason = "given with --position-unit"
+        reason = "the unit was given with --position-unit"
     elif axis_units := [name_units[index] for index in axes if index in name_units]:
         unit = axis_units[0]
         reason = "from the column names"
     elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
-            f"{max_extent:.0f} m is too large for an indoor flight; if the unit is cm, give "
-            "--position-unit"
+            f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
+            "cm, give --position-unit"
         )
     elif max_extent > max_extent_m:
-        reason = "assumed, as no unit gives an indoor flight; --position-unit sets another unit"
+        reason = (
+            "assumed, because no unit gives the extent of an indoor flight; set another unit with "
+            "--position-unit"
+        )
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
     span_m = max(float(extents[index]) * scale_by_column[index] for index in axes)

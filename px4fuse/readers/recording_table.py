@@ -73,7 +73,7 @@ class Table:
     notes: tuple[str, ...] = ()
 
     def label(self, *columns: int | None) -> str:
-        """Format the names of columns for messages, each once; skip None."""
+        """Join the names of columns for messages, without repeated columns and None."""
         labels = dict.fromkeys(
             quote(self.names[index]) if self.names[index] else f"column {index + 1}"
             for index in columns
@@ -88,7 +88,7 @@ class Table:
         )
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of the columns as text, without empty rows."""
+        """Return the cells of the columns as text, without rows in which all cells are empty."""
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -161,7 +161,7 @@ def find_table(
     if _is_complete(last_line, whole_lines.rpartition("\n")[2]):
         text += f"{last_line}\n"
     elif last_line.strip():
-        notes.append("the last line was dropped, because it has no line end")
+        notes.append("the last line of the position file was dropped, because it has no line end")
     found = None if columns else _find_json(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
@@ -185,7 +185,7 @@ def find_table(
         raise LogError(
             f"{file_name}: the header has {len(found.names)} columns, but the rows have "
             f"{row_width}.",
-            "Use decimal points, and name each column.",
+            "Write numbers with decimal points, and give each column a name.",
         )
     return replace(found, notes=(*found.notes, *notes))
 

@@ -98,7 +98,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
     files = files_below(path) if path.is_dir() else [path]
     size = sum(file_size(file, LogError) for file in files)
     if size > max_log_bytes.get():
-        raise LogError(format_size_limit(name, size, max_log_bytes.get()), f"{LOG_SIZE_REMEDY}.")
+        raise LogError(format_size_limit(name, size, max_log_bytes.get()), LOG_SIZE_REMEDY)
     hashes = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:

@@ -28,7 +28,7 @@ UNIT_NORM_TOLERANCE = 1e-15
 # Maximum fraction of rows that are dropped: a larger fraction shows that timestamps have too few
 # digits, or that the rows are of several recordings
 MAX_DROPPED_FRACTION = 0.01
-# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity
+# Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
 MAX_IDENTITY = 1e-6
 # Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
 MAX_THICKNESS_RATIO = 1 / 3
@@ -40,9 +40,9 @@ MAX_TILT_RAD = math.radians(20.0)
 MIN_REGULAR_FRACTION = 0.9
 # Maximum relative deviation of a regular interval from the median interval
 MAX_INTERVAL_DEVIATION = 0.5
-# Minimum length of a gap between poses (median intervals)
+# Minimum interval between two poses that counts as a gap, in median intervals
 MIN_GAP_INTERVALS = 2.5
-# Minimum length (s) of a gap between poses
+# Minimum interval (s) between two poses that counts as a gap
 MIN_GAP_S = 0.3
 
 # Words of comments and file names that indicate ground truth; b_w is the gyro bias in EuRoC files
@@ -170,12 +170,12 @@ def _detect_kind(
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
         if _TRUTH_WORDS.search(text):
-            return "truth", f"The kind is ground truth, according to {source}."
+            return "truth", f"The trajectory is ground truth, according to {source}."
     if (
         rotation is not None
         and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY
     ):
-        return "slam", "The kind is SLAM, because the first pose is the identity."
+        return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
 
 
@@ -190,19 +190,22 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if not is_level or tilt > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
-        "The frame is that of a camera (x right, y down, z forward), because the motion is level "
-        f"and its vertical is {math.degrees(tilt):.0f}° from y."
+        "The frame is a camera frame (x right, y down, z forward), because the motion is in a "
+        f"plane with the normal {math.degrees(tilt):.0f}° from the y axis."
     )
 
 
 def _describe_gaps(time: Array, kind: Kind) -> str:
-    """Return a note on gaps between poses or an irregular pose rate; "" if the rate is regular."""
+    """Return a note on gaps between poses or an irregular pose rate.
+
+    Return an empty string if the pose rate is regular.
+    """
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
     if is_regular.mean() < MIN_REGULAR_FRACTION:
         return (
-            f"The poses are key frames, or many poses are missing: their intervals are irregular "
+            "The poses are key frames, or many poses are missing: the pose intervals are irregular "
             f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."
         )
     gaps = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
@@ -210,8 +213,8 @@ def _describe_gaps(time: Array, kind: Kind) -> str:
         return ""
     lost_s = intervals_s[gaps] - median_s
     longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
+    fault = "Tracking was lost" if kind == "slam" else "Poses are missing"
     return (
-        f"{'Tracking was lost' if kind == 'slam' else 'Poses are missing'} for "
-        f"{lost_s.sum():.1f} s in {len(gaps)} gaps, the longest at {longest_start_s:.1f} s after "
-        "the start."
+        f"{fault} for {lost_s.sum():.1f} s in {len(gaps)} gaps. The longest gap begins "
+        f"{longest_start_s:.1f} s after the first pose."
     )
