@@ -81,7 +81,9 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     try:
         recording = read_position_file(path, body=body, is_trajectory=True)
     except LogError as error:
-        raise TrajectoryError(error.reason, error.remedy) from error
+        # evaluate and loop have no option for the columns
+        remedy = error.remedy.partition(", or name the columns")[0].removesuffix(".")
+        raise TrajectoryError(error.reason, f"{remedy}.") from error
     name, samples = recording.name, recording.samples
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()
     dropped_count = recording.row_count - len(samples)
