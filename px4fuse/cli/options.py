@@ -239,7 +239,7 @@ position_options = _combine_options(
     click.option(
         "--body",
         metavar="NAME",
-        help="Body, tag or topic, if the position file contains several.",
+        help="Body, tag or topic, if the file contains several.",
     ),
     click.option(
         "--position-frame",
