@@ -127,10 +127,15 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
         return flight
     # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
     from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
-    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
+    from px4fuse.readers.position_file import read_position_file  # noqa: PLC0415
 
-    units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
-    position_file = read_position_csv(Path(position.path), columns=position.columns, **units)
+    position_file = read_position_file(
+        position.path,
+        columns=position.columns,
+        body=position.body,
+        time_unit=position.time_unit,
+        length_unit=position.length_unit,
+    )
     clock_offset_s = None if isinstance(offset, str) else offset
     return align_position_file(
         flight,

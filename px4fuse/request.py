@@ -20,6 +20,8 @@ AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
 # Kind of a position source that the user may state, as the messages in a log can be ambiguous
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
+# Directions of x, y and z in a position file, such as east, up and south
+PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
 # Height source for the axis "down" of a flight with GNSS
 HeightName = Literal["gnss", "barometer"]
 # Coordinate frame of a trajectory file
@@ -28,12 +30,14 @@ System = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
 class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Recording of the positioning system (CSV), with its frame, columns and units.
+    """Recording of the positioning system, with its frame, columns and units.
 
     Attributes
     ----------
     path : str
-    frame : {"ned", "enu", "nwu"} or None
+    body : str or None
+        Body or tag in the file, or topic of a ROS bag; None: the only one.
+    frame : {"ned", "enu", "nwu", "eus", "edn"} or None
         Coordinate frame; None: from the column names, else the frame with the best fit to EKF2.
     yaw_deg : float, "auto" or None
         Clockwise rotation of the positions, seen from above; "auto" estimates yaw and origin.
@@ -46,7 +50,8 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     path: str
-    frame: Literal["ned", "enu", "nwu"] | None = None
+    body: str | None = None
+    frame: PositionFrame | None = None
     yaw_deg: float | Literal["auto"] | None = None
     columns: tuple[str, ...] | None = None
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
@@ -255,6 +260,7 @@ Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 _POSITION_OPTIONS = {
     "path": "--position",
+    "body": "--body",
     "frame": "--position-frame",
     "yaw_deg": "--position-yaw",
     "columns": "--position-columns",
@@ -393,5 +399,9 @@ def _option_text(value: Any) -> str:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name in a path, with question marks for bytes that are not UTF-8."""
-    return PurePath(path).name.encode(errors="replace").decode()
+    """Return the file name in a path, with the topic of a ROS bag (``BAG:/TOPIC``).
+
+    Bytes that are not UTF-8 become question marks.
+    """
+    file, topic, _ = re.split(r"((?<=..):/.*|$)", path, maxsplit=1, flags=re.DOTALL)
+    return PurePath(file).name.encode(errors="replace").decode() + topic

@@ -23,7 +23,7 @@ from px4fuse.flight.log import InputFile
 from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Reset
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers import read_log
-from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
+from px4fuse.readers.position_file import SAMPLE_COLUMNS, PositionRecording, read_position_file
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
@@ -78,7 +78,8 @@ def position_file(
     values = np.full((len(time_s), len(SAMPLE_COLUMNS)), np.nan)
     values[:, :3], values[:, 3:6] = xyz_m, sigma_m
     return PositionRecording(
-        name="uwb.csv", sha256="f" * 64, size_bytes=1234, clock="UNIX", frame=frame,
+        name="uwb.csv", sha256="f" * 64, size_bytes=1234, clock="UNIX",
+        frames=(frame,) if frame else (),
         samples=table(time_s, values, SAMPLE_COLUMNS), detected=("time: column 1",),
         notes=("two rows dropped",),
     )  # fmt: skip
@@ -128,7 +129,7 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def external(sample_log: Path) -> PositionRecording:
-    return read_position_csv(sample_log.with_name("aisle_uwb_external.csv"))
+    return read_position_file(sample_log.with_name("aisle_uwb_external.csv"))
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +219,7 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
         f"smallest residual against EKF2 position ({frame} 0.1"
     )
     assert_same_track(track, flight.positions[0], 1e-9)
-    alignment, _ = align(flight, replace(file, frame=frame))
+    alignment, _ = align(flight, replace(file, frames=(frame,) if frame else ()))
     assert alignment.frame == frame
     assert alignment.frame_reason == "according to the column names of the position file"
 
@@ -461,7 +462,8 @@ def test_align_position_file_warns_of_second_possible_offset() -> None:
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"frame": "utm"}, "`frame` utm is not a known coordinate frame. Use one of ned, enu, nwu."),
+    ({"frame": "utm"},
+     "`frame` utm is not a known coordinate frame. Use one of ned, enu, nwu, eus, edn."),
     ({"yaw_deg": float("nan")}, "`yaw_deg` nan is not a finite number."),
     ({"yaw_deg": "north"}, "`yaw_deg` north is neither a number (degrees) nor auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),

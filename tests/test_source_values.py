@@ -31,7 +31,7 @@ from px4fuse.flight.log import SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid, rounding_step
-from px4fuse.readers.position_csv import read_position_csv
+from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -118,13 +118,13 @@ def test_read_log_reads_reset_counter_and_quality(tmp_path):
     assert set(status["quality"]) == {-1.0}
 
 
-def test_read_position_csv_lists_times_of_rows_without_position(tmp_path):
+def test_read_position_file_lists_times_of_rows_without_position(tmp_path):
     rows = [f"{0.1 * at:.1f},{at + 5},{at},{at}" for at in range(40)]
     rows[10:12] = ["1.0,nan,nan,nan", "1.1,,,"]
     rows[20] = "2.0,0,0,0"
     path = tmp_path / "uwb.csv"
     path.write_text("\n".join(["time,x,y,z", *rows, ""]))
-    recording = read_position_csv(path)
+    recording = read_position_file(path)
     assert recording.invalid.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
     assert len(recording.samples) == 37
 

@@ -44,7 +44,7 @@ def explain_mismatch(
     if UNITS[convention.unit] != metres_per_unit:
         stated = next(name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit)
         faults.append(describe_unit(convention.unit, "the positions", stated, is_file=True))
-    stated = (problem.frame or "").upper()
+    stated = problem.frames[0].upper() if len(problem.frames) == 1 else ""
     is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
     if stated and axes != FRAME_AXES[stated] and not is_rotated:
         faults.append(describe_axes(axes, stated, is_mirrored=convention.is_mirrored, is_file=True))

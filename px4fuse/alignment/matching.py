@@ -19,6 +19,9 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
 # Frames that are tried if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
+# Frames that are tried with a yaw of the user; frames with y up or down are not tried, because on
+# level flights along one axis they cannot be distinguished from frames with z up
+ALL_FRAMES = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file: matching a day of positions takes five seconds
 MAX_SPAN_S = 86400.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for a good match, by reference:
@@ -44,8 +47,9 @@ class AlignmentProblem:
     ----------
     samples : DataFrame
         Positions of the file, on the clock of the file.
-    frame : str or None
-        Frame of the file; None: to be estimated.
+    frames : tuple of str
+        Possible frames of the file: one is used as it is, the best of several is estimated; empty
+        to try all of ALL_FRAMES.
     yaw_rad : float or None
         Rotation of the frame of the file relative to the frame of EKF2; None: to be estimated.
     lag_s : float or None
@@ -53,7 +57,7 @@ class AlignmentProblem:
     """
 
     samples: pd.DataFrame
-    frame: str | None
+    frames: tuple[str, ...]
     yaw_rad: float | None
     lag_s: float | None
 
@@ -108,7 +112,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     """
     value_by_option = {
         "clock_offset_s": problem.lag_s,
-        "frame": problem.frame,
+        "frame": problem.frames[0] if len(problem.frames) == 1 else None,
         "yaw_deg": problem.yaw_rad,
     }
     missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
@@ -141,13 +145,11 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
-    if tracks.horizontal_range_m(tracks.convert_to_ned(samples, "ned")) < tracks.MIN_MOTION_M:
+    frames = problem.frames or (YAW_FREE_FRAMES if yaw_rad is None else ALL_FRAMES)
+    if tracks.horizontal_range_m(tracks.convert_to_ned(samples, frames[0])) < tracks.MIN_MOTION_M:
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
         )
-    frames = YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
-    if problem.frame:
-        frames = (problem.frame,)
     matches = []
     for reference in references:
         name = reference.name

@@ -32,7 +32,7 @@ from px4fuse.flight.log import SHARED_STAMPS, ClockMap, InputFile
 from px4fuse.flight.model import Alignment, Flight, PositionTrack, Unavailable
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
-from px4fuse.readers.position_csv import PositionRecording
+from px4fuse.readers.position_file import PositionRecording
 
 # Maximum ratio of the residual at the second best time offset to the residual at the best one, for
 # a warning that the time offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
@@ -56,7 +56,7 @@ def align_position_file(
 
     Parameters
     ----------
-    frame : {"ned", "enu", "nwu"}, optional
+    frame : {"ned", "enu", "nwu", "eus", "edn"}, optional
         Directions of the axes x, y, z; by default from the column names, or else the frame that
         fits best.
     yaw_deg : float or "auto", optional
@@ -103,7 +103,8 @@ def align_position_file(
             "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
-    problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
+    frames = (frame,) if frame else recording.frames
+    problem = AlignmentProblem(samples, frames, yaw_rad, lag_s)
     try:
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
@@ -116,6 +117,8 @@ def align_position_file(
     if yaw_deg is None:
         yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
     frame_reason = "according to the column names of the position file"
+    if recording.format:
+        frame_reason = f"according to the format {recording.format}"
     if frame:
         frame_reason = "the frame was given with --position-frame"
     alignment, aligned_samples = _describe_alignment(
@@ -191,7 +194,7 @@ def _describe_alignment(
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
     samples = problem.samples
-    frame = problem.frame or ""
+    frame = problem.frames[0] if problem.frames else ""
     is_yaw_free = problem.yaw_rad is None
     yaw_rad = problem.yaw_rad or 0.0
     lag_s = problem.lag_s or 0.0
@@ -202,7 +205,7 @@ def _describe_alignment(
     if match:
         frame = match.frame
         reference = match.reference.name
-        if problem.frame is None:
+        if len(problem.frames) != 1:
             frame_reason = f"smallest residual against {reference} ({match.residuals_text})"
             if is_yaw_free and frame == "enu":
                 nwu_note = "nwu differs from enu only in yaw, which was estimated"

@@ -90,9 +90,10 @@ def evaluate(
 ) -> None:
     """Compute ATE and RPE of a trajectory against a reference.
 
-    ESTIMATE and REFERENCE are trajectory files (TUM, EuRoC, ORB-SLAM3) or tracks of a flight log:
-    LOG:vio, LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report
-    and the results as JSON.
+    ESTIMATE and REFERENCE are trajectory files (TUM, EuRoC, ORB-SLAM3, KITTI), recordings of
+    positions (FILE:BODY), topics of ROS bags (BAG:TOPIC) or tracks of a flight log: LOG:vio,
+    LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report and the
+    results as JSON.
     """
     from px4fuse.loop.tracks import file_name, read_source
     from px4fuse.report.evaluation import write_evaluation

@@ -159,11 +159,12 @@ def loop(
     """Measure and correct the loop closure error of odometry.
 
     SOURCE is a flight log (its VIO, or EKF2; LOG:vio, LOG:ekf2 and LOG:kf select the track), a
-    trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is optimised. Writes a PDF
-    report and the results as JSON, except for a pose graph.
+    trajectory (TUM, EuRoC, ORB-SLAM3, KITTI, BAG:TOPIC), or a pose graph (g2o), which is optimised.
+    Writes a PDF report and the results as JSON, except for a pose graph.
     """
+    from px4fuse.core.reading import split_part
     from px4fuse.diagnose import analyse_loop_closure
-    from px4fuse.loop.tracks import file_name, is_g2o, split_part
+    from px4fuse.loop.tracks import file_name, is_g2o
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
@@ -225,7 +226,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.loop.tracks import split_part
+    from px4fuse.core.reading import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results

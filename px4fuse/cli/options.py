@@ -29,6 +29,7 @@ from px4fuse.request import (
     AxisName,
     ComparisonRequest,
     PositionFile,
+    PositionFrame,
     SourceKind,
 )
 
@@ -232,13 +233,18 @@ position_options = _combine_options(
     click.option(
         "--position",
         type=InputPath(str),
-        metavar="FILE.csv",
-        help="Recording of the positioning system (CSV: time, x, y, z), used instead of the "
+        metavar="FILE",
+        help="Recording of the positioning system (CSV or BAG:TOPIC), used instead of the "
         "positions in LOG.",
     ),
     click.option(
+        "--body",
+        metavar="NAME",
+        help="Body, tag or topic, if the file contains several.",
+    ),
+    click.option(
         "--position-frame",
-        type=Choice(("ned", "enu", "nwu")),
+        type=Choice(get_args(PositionFrame)),
         help="Coordinate frame of x, y, z in the position file.  [default: from the column names, "
         "else the frame with the best fit to EKF2]",
     ),

@@ -12,6 +12,8 @@ FRAME_AXES: dict[str, Axes] = {
     "NED": ("north", "east", "down"),
     "ENU": ("east", "north", "up"),
     "NWU": ("north", "west", "up"),
+    "EUS": ("east", "up", "south"),
+    "EDN": ("east", "down", "north"),
 }
 UNIT_NAMES: dict[Unit, str] = {
     "m": "metres",

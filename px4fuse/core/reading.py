@@ -5,20 +5,29 @@ a file is opened, because reading a device, named pipe or socket may never end, 
 may be larger than the memory.
 """
 
+import gzip
 import hashlib
 import os
 import stat
+import sys
+import zlib
 from collections.abc import Iterable
 from contextlib import suppress
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
 
 from px4fuse.core.input_files import add_input
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
 #: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
+LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
 _BYTES_PER_MB = 1_000_000
 
 
@@ -29,6 +38,14 @@ def display_name(path: Path) -> str:
     ('a.ulg', '.', 'a b')
     """
     return to_one_line(path.name or str(path))
+
+
+def split_part(argument: str) -> tuple[Path, str | None]:
+    """Split ``FILE:PART``: a track of a log, a body of a table, or a topic of a ROS bag."""
+    path, colon, part = argument.rpartition(":")
+    if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
+        return Path(path), part
+    return Path(argument), None
 
 
 def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
@@ -107,7 +124,7 @@ def read_bytes_limited(
     if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
     if (actual_size := max(size, len(content))) > limit_bytes:
-        raise error_type(_too_large(name, actual_size, limit_bytes), size_remedy)
+        raise error_type(format_size_limit(name, actual_size, limit_bytes), size_remedy)
     if empty_remedy is not None and not content:
         raise error_type(f"{name}: the file is empty", empty_remedy)
     return content
@@ -123,7 +140,7 @@ def read_log_bytes(path: Path) -> bytes:
     """
     limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again."
     return read_bytes_limited(
-        path, LogError, limit, size_remedy=_SIZE_REMEDY, empty_remedy=empty_remedy
+        path, LogError, limit, size_remedy=LOG_SIZE_REMEDY, empty_remedy=empty_remedy
     )
 
 
@@ -170,7 +187,9 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
             ]
         elif (size := file_size(path, LogError)) > limit:
-            raise LogError(_too_large(display_name(path), size, limit), _SIZE_REMEDY)
+            raise LogError(
+                format_size_limit(display_name(path), size, limit), f"{LOG_SIZE_REMEDY}."
+            )
         else:
             files = [path]
         for file in files:
@@ -205,10 +224,18 @@ def files_below(folder: Path) -> list[Path]:
 
 def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:
     try:
-        with path.open("rb") as file:
-            return file.read(count)
-    except OSError as error:
+        with _open(path) as file:
+            content: bytes = file.read(count)
+            return content
+    except (OSError, EOFError, zlib.error, zstd.ZstdError) as error:
         raise _unreadable(name, error, error_type) from error
+
+
+def _open(path: Path) -> Any:
+    """Open a file; the content of a file that gzip or zstd compressed is read decompressed."""
+    with path.open("rb") as file:
+        library = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
+    return library.open(path) if library else path.open("rb")
 
 
 def _unreadable(
@@ -218,6 +245,7 @@ def _unreadable(
     return error_type(f"{name}: the file cannot be read ({reason}).", remedy)
 
 
-def _too_large(name: str, *sizes: int) -> str:
+def format_size_limit(name: str, *sizes: int) -> str:
+    """Format the error of a file whose size (bytes) exceeds the limit (bytes)."""
     size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
     return f"{name}: the file has {size} MB, more than the limit of {limit} MB"

@@ -12,7 +12,7 @@ from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.core.arrays import Array
-from px4fuse.core.reading import display_name, read_head
+from px4fuse.core.reading import display_name, read_head, split_part
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.log import WITHHELD
@@ -27,6 +27,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.common import finite_rows
+from px4fuse.readers.ros_bag import is_bag
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
@@ -187,29 +188,7 @@ class LoopSource:
 def file_name(source: Path) -> str:
     """Return the start of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
     path, track_name = split_part(str(source))
-    return path.stem if track_name is None else f"{path.stem}_{track_name}"
-
-
-def split_part(argument: str) -> tuple[Path, TrackName | None]:
-    """Split ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth`` into file and track.
-
-    Raises
-    ------
-    TrajectoryError
-        The text after the colon is not a track.
-    """
-    full_path = Path(argument)
-    path, colon, track_name = argument.rpartition(":")
-    if full_path.exists() or not colon:
-        return full_path, None
-    if track_name in TRACK_NAMES:
-        return Path(path), track_name
-    if Path(path).is_file():
-        raise TrajectoryError(
-            f"{display_name(Path(path))}: {track_name!r} is not the name of a track in a log",
-            f"Use one of {', '.join(TRACK_NAMES)}.",
-        )
-    return full_path, None
+    return "_".join([path.stem, *(track_name or "").split("/")]).rstrip("_")
 
 
 def is_g2o(path: Path) -> bool:
@@ -220,7 +199,7 @@ def is_g2o(path: Path) -> bool:
     TrajectoryError
         The file cannot be read.
     """
-    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
     return decode_text(head) is not None and any(
         line.strip().startswith(_G2O_TAGS) for line in head.splitlines()
     )
@@ -238,7 +217,7 @@ def read_source(
     Parameters
     ----------
     argument : str
-        See :func:`split_part`.
+        ``FILE``, ``LOG:TRACK``, ``TABLE:BODY`` or ``BAG:TOPIC``.
     default : {"vio", "ekf2", "kf", "truth"}, optional
         Track of a log if ``argument`` contains none; by default odometry, else EKF2's track.
     frame : Frame, optional
@@ -254,7 +233,7 @@ def read_source(
         ``frame`` is given for a flight log.
     """
     path, track_name = split_part(argument)
-    head = read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"bag" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):
@@ -263,12 +242,7 @@ def read_source(
             f"Optimise it with px4fuse loop {display_name(path)}.",
         )
     if decode_text(head) is not None:  # flight logs are binary
-        if track_name is not None:
-            raise TrajectoryError(
-                f"{display_name(path)} is a trajectory file and has no track {track_name!r}.",
-                f"Omit :{track_name}.",
-            )
-        trajectory = read_trajectory(path)
+        trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
@@ -276,6 +250,11 @@ def read_source(
             "Omit --frame.",
         )
     flight = read_log(path, system=system)
+    if track_name not in (None, *TRACK_NAMES):
+        raise TrajectoryError(
+            f"{display_name(path)}: {track_name!r} is not the name of a track in a log",
+            f"Use one of {', '.join(TRACK_NAMES)}.",
+        )
     chosen_track = track_name or default
     if chosen_track is None:
         odometry = find_odometry(flight)

@@ -5,38 +5,21 @@ from pathlib import Path
 from px4fuse.core.reading import display_name, read_head, read_log_bytes
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
+from px4fuse.readers.formats import refuse_foreign_format
 
-_SNIFF_BYTES = 16
+_SNIFF_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Formats that px4fuse does not read, but users try: first bytes of the file, suffixes of its name,
-# and fault and action of the error message
-_FOREIGN_FORMATS = (
-    # Header bytes of ArduPilot, libraries/AP_Logger/LogStructure.h
-    (
-        b"\xa3\x95",
-        (),
-        "the file is an ArduPilot DataFlash log, not a PX4 ULog",
-        "Give the MAVLink recording (.tlog) of the ground station.",
-    ),
-    (
-        b"%PDF-",
-        (),
-        "the file is a PDF, not a flight log",
-        "Check a report with px4fuse verify {name} LOG.",
-    ),
-    (
-        b"",
-        (".csv", ".tsv"),
-        "the file is a table, not a flight log",
+# Kind of file and remedy by the suffixes of text files that users give instead of a flight log
+_TEXT_FILES = {
+    (".csv", ".tsv", ".jsonl"): (
+        "table",
         "If the table contains positions, use px4fuse compare LOG --position {name}.",
     ),
-    (
-        b"",
-        (".tum", ".g2o"),
-        "the file is a trajectory or pose graph, not a flight log",
+    (".tum", ".g2o"): (
+        "trajectory or pose graph",
         "Use px4fuse evaluate or px4fuse loop {name}.",
     ),
-)
+}
 
 
 def read_log(path: str | Path, *, system: int | None = None) -> Flight:
@@ -45,7 +28,8 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     Parameters
     ----------
     path : str or Path
-        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream).
+        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream); gzip or zstd may
+        have compressed it.
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
 
@@ -70,10 +54,12 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))
-    for magic, suffixes, description, remedy in _FOREIGN_FORMATS:
-        has_suffix = path.suffix.lower() in suffixes and head.isascii()
-        if has_suffix or (magic and head.startswith(magic)):
-            raise LogError(f"{name}: {description}", remedy.format(name=name))
+    refuse_foreign_format(path, head, LogError)
+    for suffixes, (kind, remedy) in _TEXT_FILES.items():
+        if path.suffix.lower() in suffixes and head.isascii():
+            raise LogError(
+                f"{name}: the file is a {kind}, not a flight log", remedy.format(name=name)
+            )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
     return read_mavlink(name, read_log_bytes(path), system)

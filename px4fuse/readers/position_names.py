@@ -27,6 +27,8 @@ _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES[
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Column names without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
+# Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
+_QUATERNION_NAME = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
 # Coordinate frames with the names of their axes. The first frame with both horizontal axes in the
 # file is used
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
@@ -64,7 +66,10 @@ def read_column_name(name: str) -> ColumnMeaning:
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     column_words = re.findall(r"[^\W_]+", plain_name)
-    unit = _UNITS.get(column_words[-1], "") if len(column_words) > 1 else ""
+    unit = _UNITS.get(column_words[-1], "") if column_words else ""
+    if len(column_words) == 1 and unit in TIME_UNITS and len(column_words[0]) > 2:
+        return ColumnMeaning("time", "time", unit)  # such as "sec" and "nanosec"
+    unit = unit if len(column_words) > 1 else ""
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
     if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
@@ -100,7 +105,7 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
             groups.setdefault(column.group, {}).setdefault(column.key, index)
     for axis_count in (3, 2):
         for axes in groups.values():
-            for frame, names in _FRAMES:
+            for frame, names in () if "w" in axes else _FRAMES:  # x, y, z, w is a quaternion
                 if {*names[:axis_count]} <= axes.keys():
                     return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
     return None
@@ -117,3 +122,12 @@ def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[in
         sigmas.get(axis, sigmas.get(letter, sigmas.get("")))
         for axis, letter in zip(axes, "xyz", strict=True)
     )
+
+
+def find_quaternion(names: Sequence[str]) -> list[int]:
+    """Return the column indices of the quaternion x, y, z, w; empty if the file has none."""
+    indices: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if match := _QUATERNION_NAME.search(name.casefold()):
+            indices.setdefault(match[1], index)
+    return [indices[axis] for axis in "xyzw"] if len(indices) == 4 else []

@@ -1,6 +1,6 @@
 """Functions for text tables: decoding, numbers, and errors with the line number.
 
-Used by the readers of position files, trajectories and pose graphs (g2o).
+Used by the readers of recordings and pose graphs (g2o).
 """
 
 import re
@@ -88,19 +88,13 @@ class Rows:
         if len(invalid_indices):
             raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
 
-    def parse(
-        self, words: int, values: int, separator: str | None = None
-    ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Parse rows in which columns of words precede columns of numbers.
-
-        A ``#`` begins a comment.
+    def parse(self, words: int, values: int) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
+        """Parse rows of word columns followed by number columns, separated by white space.
 
         Parameters
         ----------
         words, values : int
             Number of word columns and of number columns.
-        separator : str, optional
-            Column separator; white space by default.
 
         Returns
         -------
@@ -116,9 +110,9 @@ class Rows:
         texts = [text for _, text in self.lines]
         columns = [("words", "U80", (words,)), ("values", "f8", (values,))]
         try:
-            table = np.loadtxt(texts, dtype=columns, delimiter=separator, ndmin=1)
+            table = np.loadtxt(texts, dtype=columns, ndmin=1)
         except ValueError as error:
-            row_fields = (text.partition("#")[0].split(separator) for text in texts)
+            row_fields = (text.split() for text in texts)
             is_valid = (
                 len(fields) == words + values
                 and all(is_number(field_text.strip()) for field_text in fields[words:])

@@ -1,48 +1,33 @@
-"""Reader of trajectory files: TUM, EuRoC ground truth and ORB-SLAM3.
+"""Reader of trajectories: TUM, EuRoC, ORB-SLAM3, KITTI, ROS bags and all recordings of positions.
 
-TUM is ``time tx ty tz qx qy qz qw`` in seconds, separated by blanks (Sturm 2012). EuRoC ground
-truth is ``time, x, y, z, qw, qx, qy, qz, ...`` in nanoseconds, separated by commas (Burri 2016).
 ORB-SLAM3's ``SaveTrajectoryEuRoC`` writes TUM columns with nanoseconds and omits frames without
 tracking. The format is detected from the content and reported in the notes.
 """
 
-import hashlib
 import math
 import re
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.reading import display_name, read_bytes_limited
-from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, Rows, decode_text, is_number, quote
-from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
+from px4fuse.core.reading import read_head
+from px4fuse.errors import LogError, TrajectoryError
+from px4fuse.readers.position_file import PositionRecording, read_position_file
+from px4fuse.readers.recording_table import NO_HEADER
+from px4fuse.readers.ros_bag import is_bag
+from px4fuse.trajectory.model import Frame, Kind, Trajectory
 
-MAX_FILE_BYTES = 500_000_000
-TUM_COLUMNS = 8
-# Numbers of columns in EuRoC files: pose only, or also velocity and biases of gyro and
-# accelerometer
-EUROC_COLUMNS = (8, 17)
-# Maximum median interval (s) between poses that is not reported as doubtful: a longer interval may
-# be in milliseconds
-MAX_USUAL_INTERVAL_S = 10.0
-# Maximum plausible median interval (s) between poses: key frames may have minutes between them
-MAX_INTERVAL_S = 1000.0
-# Minimum plausible median interval (s) between poses: frame rates are below 1 kHz
-MIN_INTERVAL_S = 1e-3
-UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 # Maximum deviation of a valid quaternion from norm 1
 MAX_NORM_ERROR = 0.1
 # Maximum absolute coordinate (m): larger values are timestamps or damaged text
 MAX_COORDINATE_M = 1e9
 # Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
 UNIT_NORM_TOLERANCE = 1e-15
-# Maximum fraction of repeated timestamps: a larger fraction shows that timestamps have too few
-# digits
-MAX_REPEATED_FRACTION = 0.01
+# Maximum fraction of rows that are dropped: a larger fraction shows that timestamps have too few
+# digits, or that the rows are of several recordings
+MAX_DROPPED_FRACTION = 0.01
 # Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
 MAX_IDENTITY = 1e-6
 # Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
@@ -60,21 +45,23 @@ MIN_GAP_INTERVALS = 2.5
 # Minimum interval (s) between two poses that counts as a gap
 MIN_GAP_S = 0.3
 
-_TUM = "TUM (time x y z qx qy qz qw)"
-_EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
-# Column names of quaternion components in EuRoC headers, such as "q_RS_w []" and "qw"
-_QUATERNION_NAME = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
-_TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
-_REMEDY = f"Export the trajectory in the format {_TUM} with times in seconds."
+# Words of comments and file names that indicate ground truth; b_w is the gyro bias in EuRoC files
+_TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE)
+# Number of bytes at the start of a file in which comments are searched
+_HEAD_BYTES = 4096
+_FRAMES: dict[tuple[str, ...], Frame] = {("ned",): "NED", ("enu",): "ENU", ("edn",): "camera"}
 
 
-def read_trajectory(path: str | Path) -> Trajectory:
+def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     """Read a trajectory file.
 
     Parameters
     ----------
     path : str or Path
-        File in the format of TUM, EuRoC ground truth or ORB-SLAM3.
+        File in the format of TUM, EuRoC ground truth or ORB-SLAM3, or a recording that
+        :func:`px4fuse.readers.position_file.read_position_file` reads.
+    body : str, optional
+        Body or tag in the file, or topic of a ROS bag.
 
     Returns
     -------
@@ -87,61 +74,55 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises
     ------
     TrajectoryError
-        The file cannot be read or is not a trajectory, has fewer than three poses, timestamps that
-        go back, numbers that are not finite, or quaternions without unit length.
+        The file cannot be read or contains no positions with height, fewer than three poses, more
+        than 1 % invalid rows, or quaternions without unit length.
     """
     path = Path(path)
-    name = display_name(path)
-    content = read_bytes_limited(
-        path, TrajectoryError, MAX_FILE_BYTES, empty_remedy="Export the trajectory again."
-    )
-    rows, comments, truncation_note = _split_rows(name, content)
-    first_row = rows.lines[0][1].partition("#")[0]
-    separator = "," if "," in first_row else None
-    columns = len(_fields(first_row))
-    if columns not in ((TUM_COLUMNS,) if separator is None else EUROC_COLUMNS):
-        raise rows.row_error(
-            0,
-            f"the line has {columns} columns; TUM has {TUM_COLUMNS} separated by blanks, EuRoC "
-            f"{EUROC_COLUMNS[0]} or {EUROC_COLUMNS[1]} separated by commas",
-            _REMEDY,
+    try:
+        recording = read_position_file(path, body=body, is_trajectory=True)
+    except LogError as error:
+        # evaluate and loop have no option for the columns
+        remedy = error.remedy.partition(", or name the columns")[0].removesuffix(".")
+        raise TrajectoryError(error.reason, f"{remedy}.") from error
+    name, samples = recording.name, recording.samples
+    position = samples[["x_m", "y_m", "z_m"]].to_numpy()
+    dropped_count = recording.row_count - len(samples)
+    if recording.format == NO_HEADER:
+        raise TrajectoryError(
+            f"{name} has no header that names its columns",
+            "Add a header such as '# time x y z qx qy qz qw'.",
         )
-    is_w_first, format_name = _detect_quaternion_order(rows, separator, comments)
-    timestamps, values = rows.parse(1, columns - 1, separator)
-    time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
-    rows.raise_where(
-        ~(np.abs(values[:, :7]) < MAX_COORDINATE_M),
-        f"the line contains a value that is not finite or above {MAX_COORDINATE_M:.0e}",
-        "Remove this line.",
-    )
-    position = values[:, :3]
-    rotation = _read_rotation(rows, values[:, 3:7], is_w_first)
-    is_kept, dropped_note = _increasing_rows(rows, time)
-    time, position, rotation = time[is_kept], position[is_kept], rotation[is_kept]
-    kind, kind_note = _detect_kind(path, columns, comments, position, rotation)
+    if dropped_count > MAX_DROPPED_FRACTION * recording.row_count:
+        raise TrajectoryError(
+            f"{name}: {dropped_count} of {recording.row_count} rows are not valid poses "
+            f"({'; '.join(recording.notes)})",
+            "Export the timestamps with all digits (%.9f), and remove other rows.",
+        )
+    if np.isnan(position).any():
+        raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
+    rotation = _read_rotation(recording)
+    is_text = not is_bag(path)
+    head = read_head(path, _HEAD_BYTES, TrajectoryError).decode(errors="replace") if is_text else ""
+    comments = "\n".join(re.findall(r"(?m)^\s*#.*", head))
+    kind, kind_note = _detect_kind(path, comments, position, rotation)
     frame, frame_note = _detect_frame(kind, position)
-    is_unix = UNIX_START_S <= time[0] < UNIX_END_S
-    clock_text = "UNIX times" if is_unix else "not UNIX times"
-    reader_notes = (
-        f"The format is {format_name}; the timestamps are {clock_text}.",
-        time_note,
-        kind_note,
-        frame_note,
-        dropped_note,
-        _describe_gaps(time, kind),
-        truncation_note,
-    )
+    time = samples.index.to_numpy()
+    notes = (*recording.detected, *recording.notes)
+    more_notes = (kind_note, frame_note, _describe_gaps(time, kind))
     return Trajectory(
         name=name,
         kind=kind,
         time_s=time,
         position_m=position,
         rotation=rotation,
-        frame=frame,
-        unix_offset_s=0.0 if is_unix else None,
-        sha256=hashlib.sha256(content).hexdigest(),
-        size_bytes=len(content),
-        notes=tuple(note for note in reader_notes if note),
+        frame=_FRAMES.get(recording.frames, frame),
+        unix_offset_s=0.0 if recording.clock == "UNIX" else None,
+        sha256=recording.sha256,
+        size_bytes=recording.size_bytes,
+        notes=(
+            *(f"{note[0].upper()}{note[1:]}." for note in notes),
+            *(note for note in more_notes if note),
+        ),
     )
 
 
@@ -169,154 +150,33 @@ def tum_text(trajectory: Trajectory) -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
 
 
-def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Return the numeric rows, the comments (with header), and a note on a dropped last row."""
-    text = decode_text(content)
-    if text is None:
-        fault, remedy = "a binary file", _REMEDY
-        if content.startswith(b"ULog"):
-            fault, remedy = "a PX4 log", f"Choose a track of the log: {name}:vio or {name}:ekf2."
-        raise TrajectoryError(f"{name} is {fault}, not a trajectory file", remedy)
-    lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
-    comments = [line for _, line in lines if line.lstrip().startswith("#")]
-    numeric_rows = [row for row in lines if not row[1].lstrip().startswith("#")]
-    # A line that is not numeric is a header without #, if a numeric line is below it
-    is_numeric = [_is_numeric_row(line) for _, line in numeric_rows[:2]]
-    if is_numeric == [False, True]:
-        comments.append(numeric_rows.pop(0)[1])
-    elif is_numeric and not is_numeric[0]:
+def _read_rotation(recording: PositionRecording) -> Rotation | None:
+    quaternions = recording.quaternions
+    if quaternions is None:
+        return None
+    norms = np.linalg.norm(quaternions, axis=1)
+    if not (np.abs(norms - 1.0) <= MAX_NORM_ERROR).all():
         raise TrajectoryError(
-            f"{name} is not a trajectory file: the first line is {quote(numeric_rows[0][1])}",
-            _REMEDY,
+            f"{recording.name}: a quaternion does not have norm 1",
+            "Check the columns qx, qy, qz and qw.",
         )
-    truncation_note = ""
-    widths = [len(_fields(line)) for _, line in (*numeric_rows[:1], *numeric_rows[-1:])]
-    if not text.endswith("\n") and widths != sorted(widths):
-        truncation_note = (
-            f"The last line (line {numeric_rows.pop()[0]}) is incomplete and was dropped."
-        )
-    if len(numeric_rows) < MIN_POSES:
-        raise TrajectoryError(
-            f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
-            "Export the trajectory again.",
-        )
-    return Rows(name, numeric_rows), "\n".join(comments), truncation_note
-
-
-def _fields(line: str) -> list[str]:
-    line = line.partition("#")[0]
-    return line.split("," if "," in line else None)
-
-
-def _is_numeric_row(line: str) -> bool:
-    return all(is_number(field.strip()) for field in _fields(line))
-
-
-def _detect_quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
-    """Return True if w is the first quaternion component, and the name of the format.
-
-    Without a header, blanks mean TUM, and commas with UNIX time in nanoseconds mean EuRoC.
-    """
-    order = "".join(_QUATERNION_NAME.findall(comments.casefold())[-4:])
-    is_w_first = order == "wxyz"
-    if order not in ("wxyz", "xyzw") and separator is not None:
-        first_row = _fields(rows.lines[0][1])
-        has_header = any(len(line.split(",")) == len(first_row) for line in comments.split("\n"))
-        is_w_first = not has_header and float(first_row[0]) * 1e-9 >= UNIX_START_S
-        if not is_w_first:
-            raise rows.row_error(
-                0,
-                "the header does not contain the order of the quaternion components",
-                "Add a header such as '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z'.",
-            )
-    if is_w_first == (separator is not None):
-        return is_w_first, _EUROC if is_w_first else _TUM
-    order = "blanks and quaternion order wxyz" if is_w_first else "commas and quaternion order xyzw"
-    return is_w_first, f"a table separated by {order}, according to the header"
-
-
-def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
-    """Convert the timestamps to seconds; also return a note on the unit, or an empty string."""
-    is_invalid = np.array(
-        [not is_number(text.strip()) or not np.isfinite(float(text)) for text in timestamps]
-    )
-    rows.raise_where(is_invalid, "the first column is not a time", "Correct or remove this line.")
-    values = np.array(timestamps, dtype=np.float64)
-    median_interval = float(np.median(np.abs(np.diff(values))))
-    if median_interval <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
-        if median_interval < MAX_USUAL_INTERVAL_S:
-            return values, ""
-        return values, (
-            f"The timestamps are read as seconds; the median interval is {median_interval:.0f} s. "
-            "Check that the unit is not milliseconds."
-        )
-    for unit, units_per_second in UNITS_PER_SECOND.items():
-        first_s = float(values[0]) / units_per_second
-        latest_s = float(np.abs(values).max()) / units_per_second
-        # Times that are not UNIX time must be in nanoseconds, as ORB-SLAM3 writes them
-        if (
-            (first_s >= UNIX_START_S or unit == "nanoseconds")
-            and latest_s < UNIX_END_S
-            and MIN_INTERVAL_S <= median_interval / units_per_second <= MAX_INTERVAL_S
-        ):
-            counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
-            # Seconds and remainder are divided separately: float64 cannot represent UNIX time in ns
-            seconds = counts // units_per_second + counts % units_per_second / units_per_second
-            return seconds, f"The timestamps were converted from {unit} to seconds."
-    raise TrajectoryError(
-        f"{rows.file_name}: the median interval of the timestamps, {median_interval:.3g}, is not "
-        "valid in any unit from seconds to nanoseconds",
-        "Give timestamps in seconds.",
-    )
-
-
-def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
-    """Return a mask of the rows without repeated timestamps, and a note on the other rows."""
-    steps = np.diff(time, prepend=-np.inf)
-    rows.raise_where(
-        steps < 0.0,
-        "the timestamp is earlier than in the line above",
-        "Sort the lines by time, or write each recording to a separate file.",
-    )
-    repeated_count = int((steps == 0.0).sum())
-    if repeated_count > MAX_REPEATED_FRACTION * len(steps):
-        rows.raise_where(
-            steps == 0.0,
-            f"this line and {repeated_count - 1} others have the same timestamp as the line above",
-            "Export the timestamps with all digits (%.9f).",
-        )
-    note = (
-        f"Number of dropped poses with a repeated timestamp: {repeated_count}."
-        if repeated_count
-        else ""
-    )
-    return steps > 0.0, note
-
-
-def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
-    norms = np.linalg.norm(quaternion, axis=1)
-    rows.raise_where(
-        np.abs(norms - 1.0) > MAX_NORM_ERROR,
-        "columns 5 to 8 are not a quaternion with norm 1",
-        f"Remove this line, or check the order of the columns. {_REMEDY}",
-    )
     norms[np.abs(norms - 1.0) < UNIT_NORM_TOLERANCE] = 1.0
-    quaternion = np.roll(quaternion, -1, axis=1) if is_w_first else quaternion
-    return Rotation(quaternion / norms[:, None], normalize=False)
+    return Rotation(quaternions / norms[:, None], normalize=False)
 
 
 def _detect_kind(
-    path: Path, columns: int, comments: str, position: Array, rotation: Rotation
+    path: Path, comments: str, position: Array, rotation: Rotation | None
 ) -> tuple[Kind, str]:
-    if columns == EUROC_COLUMNS[1]:
-        return "truth", "The trajectory is ground truth, according to the 17 columns of the file."
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
         if _TRUTH_WORDS.search(text):
             return "truth", f"The trajectory is ground truth, according to {source}."
-    if max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY:
+    if (
+        rotation is not None
+        and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY
+    ):
         return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
 

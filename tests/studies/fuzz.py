@@ -51,7 +51,7 @@ from px4fuse.diagnose import diagnose_or_check_aids  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
 from px4fuse.readers.g2o import read_g2o  # noqa: E402
-from px4fuse.readers.position_csv import read_position_csv  # noqa: E402
+from px4fuse.readers.position_file import read_position_file  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
 from px4fuse.results import answer_form  # noqa: E402
@@ -215,7 +215,7 @@ TARGETS = (
     Target("ULog", _ulogs, read_log, ".ulg", False, 60, 0.5),
     Target("MAVLink", _recordings, read_log, ".tlog", False, 60, 0.5),
     Target("trajectory", _text(_TRACK, _EUROC, _KITTI), read_trajectory, ".txt", True, 1800, 20.0),
-    Target("position file", _text(*_POSITIONS), read_position_csv, ".csv", True, 300, 5.0),
+    Target("position file", _text(*_POSITIONS), read_position_file, ".csv", True, 300, 5.0),
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(

@@ -11,13 +11,13 @@ from conftest import REPOSITORY, shared
 from time_limit import time_limit
 
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
-from px4fuse.readers import position_csv
-from px4fuse.readers.position_csv import (
+from px4fuse.readers import position_file
+from px4fuse.readers.position_file import (
     LENGTH_UNITS,
     SAMPLE_COLUMNS,
     TIME_UNITS,
     PositionRecording,
-    read_position_csv,
+    read_position_file,
 )
 
 AXES = ["x_m", "y_m", "z_m"]
@@ -72,7 +72,7 @@ def read(tmp_path: Path) -> Callable[..., PositionRecording]:
     def read_(content: str | bytes, **options) -> PositionRecording:
         path = tmp_path / "uwb.csv"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return read_position_csv(path, **options)
+        return read_position_file(path, **options)
 
     return read_
 
@@ -121,6 +121,9 @@ DIALECTS: dict[str, str | bytes] = {
     "space": table(PLAIN, separator=" "),
     "leading spaces": "  " + table(PLAIN, separator="  ", end="\n  "),
     "quotes": table(PLAIN, quote='"'),
+    "decimal commas": table({"Zeit [s]": UNIX_S, **PLAIN_XYZ}, separator=";", decimal=","),
+    "no header": table(PLAIN, header=False),
+    "no header, decimal commas": table(PLAIN, header=False, separator=";", decimal=","),
     "byte order mark": b"\xef\xbb\xbf" + table(PLAIN).encode(),
     "Latin-1": table({"t [µs]": exact(UNIX_US + TIME_US, 0), "x": X, "y": Y, "z": Z}).encode(
         "latin-1"
@@ -140,7 +143,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_position_csv_of_every_dialect_gives_equal_samples(read, dialect):
+def test_read_position_file_of_every_dialect_gives_equal_samples(read, dialect):
     content = DIALECTS[dialect]
     content = content if isinstance(content, bytes) else content.encode()
     file = read(content)
@@ -148,7 +151,7 @@ def test_read_position_csv_of_every_dialect_gives_equal_samples(read, dialect):
     assert (file.name, file.size_bytes) == ("uwb.csv", len(content))
     assert file.sha256 == hashlib.sha256(content).hexdigest()
     assert file.clock == "UNIX"
-    assert file.frame is None
+    assert file.frames == ()
     assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
 
 
@@ -183,14 +186,14 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
 
 
 @pytest.mark.parametrize("case", TIMES)
-def test_read_position_csv_detects_time_unit_and_clock(read, case):
+def test_read_position_file_detects_time_unit_and_clock(read, case):
     name, texts, start_us, clock = TIMES[case]
     file = read(table({name: texts, "x": X, "y": Y, "z": Z}))
     assert_track(file, start_us=start_us)
     assert file.clock == clock
 
 
-def test_read_position_csv_keeps_microseconds_of_ns_timestamps(read):
+def test_read_position_file_keeps_microseconds_of_ns_timestamps(read):
     stamps = [1_795_253_650_123_456_789 + 1000 * i for i in range(5)]
     rows = "".join(f"{stamp},{i},0.5,1.5\n" for i, stamp in enumerate(stamps))
     file = read("t_ns,x,y,z\n" + rows)
@@ -199,7 +202,7 @@ def test_read_position_csv_keeps_microseconds_of_ns_timestamps(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_read_position_csv_with_0_2_or_200_hz_adds_no_note(read, rate):
+def test_read_position_file_with_0_2_or_200_hz_adds_no_note(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
@@ -207,15 +210,15 @@ def test_read_position_csv_with_0_2_or_200_hz_adds_no_note(read, rate):
 
 
 @pytest.mark.parametrize("step", ["0.0001", "1e7"])
-def test_read_position_csv_with_implausible_rate_adds_note(read, step):
+def test_read_position_file_with_implausible_rate_adds_note(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
-    assert_stated(file, "is not plausible for UWB", "--position-time-unit")
+    assert_stated(file, "s is unusual", "--position-time-unit")
     assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
 
 
 @pytest.mark.parametrize("unit", TIME_UNITS)
-def test_read_position_csv_time_unit_overrides_column_name(read, unit):
+def test_read_position_file_time_unit_overrides_column_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
@@ -230,7 +233,7 @@ LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
     ({"bag_time": UNIX_S, "header_stamp": [""] * ROWS}, ("; not used: 'header_stamp')",)),
     ({"recv_time": LATER_S, "time": UNIX_S}, ("; not used: 'recv_time')",)),
 ])  # fmt: skip
-def test_read_position_csv_prefers_measurement_time(read, columns, words):
+def test_read_position_file_prefers_measurement_time(read, columns, words):
     file = read(table({**columns, "x": X, "y": Y, "z": Z}))
     assert_track(file)
     assert_stated(file, "time: ", *words)
@@ -266,23 +269,23 @@ POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
 
 @pytest.mark.parametrize("separator", [",", " "])
 @pytest.mark.parametrize("case", POSITIONS)
-def test_read_position_csv_detects_frame_from_column_names(read, case, separator):
+def test_read_position_file_detects_frame_from_column_names(read, case, separator):
     columns, frame = POSITIONS[case]
     file = read(table({"time": UNIX_S, **columns}, separator=separator))
     assert_track(file)
-    assert file.frame == frame
+    assert file.frames == ((frame,) if frame else ())
 
 
 @pytest.mark.parametrize(("case", "words"), [
     ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_read_position_csv_states_the_used_position_columns(read, case, words):
+def test_read_position_file_states_the_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 
 @pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_read_position_csv_unit_option_overrides_column_name(read, unit):
+def test_read_position_file_unit_option_overrides_column_name(read, unit):
     columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
     samples = read(table(columns), length_unit=unit).samples
     assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
@@ -294,7 +297,7 @@ def test_read_position_csv_unit_option_overrides_column_name(read, unit):
     ([*X[:7], "4000.0", *X[8:]], "unit m (assumed, because the column names contain no unit)"),
     (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
 ])  # fmt: skip
-def test_read_position_csv_unit_is_not_changed_by_outlier(read, x, words):
+def test_read_position_file_unit_is_not_changed_by_outlier(read, x, words):
     file = read(table({**PLAIN, "x": x}))
     assert file.samples["x_m"].tolist() == list(map(float, x))
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
@@ -302,7 +305,7 @@ def test_read_position_csv_unit_is_not_changed_by_outlier(read, x, words):
 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
-def test_read_position_csv_without_height_sets_z_to_nan(read, extra):
+def test_read_position_file_without_height_sets_z_to_nan(read, extra):
     file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra}))
     assert file.samples["z_m"].isna().all()
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
@@ -322,7 +325,7 @@ SIGMA = fixed(SIGMA_M, 3)
     ({"stdev": SIGMA}, (1, 1, 1)),
     ({"raw_sigma": SIGMA, "filtered_sigma": fixed(9 * SIGMA_M, 3)}, (1, 1, 1)),
 ])  # fmt: skip
-def test_read_position_csv_reads_sigma_columns(read, columns, factors):
+def test_read_position_file_reads_sigma_columns(read, columns, factors):
     file = read(table({**PLAIN, **columns}))
     assert_track(file)
     sigmas = file.samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()
@@ -330,7 +333,7 @@ def test_read_position_csv_reads_sigma_columns(read, columns, factors):
     assert_stated(file, "sigma: ", repr(next(iter(columns))))
 
 
-def test_read_position_csv_sets_non_positive_sigma_to_nan(read):
+def test_read_position_file_sets_non_positive_sigma_to_nan(read):
     sigma = [*SIGMA]
     sigma[3], sigma[4] = "0", "-1"
     file = read(table({**PLAIN, "sigma": sigma}))
@@ -347,7 +350,7 @@ def test_read_position_csv_sets_non_positive_sigma_to_nan(read):
     ["nan", "", "null", "-", "-inf", "1e999", "12.3m", "1.2.3", "1_000", "1,5", "soon", ".", "0x1f",
      "١", "infinite"],
 )  # fmt: skip
-def test_read_position_csv_drops_rows_without_position(read, missing):
+def test_read_position_file_drops_rows_without_position(read, missing):
     x, z = [*X], [*Z]
     x[0] = x[20] = z[21] = missing
     file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
@@ -355,7 +358,7 @@ def test_read_position_csv_drops_rows_without_position(read, missing):
     assert_stated(file, "dropped rows without valid time or position: 3")
 
 
-def test_read_position_csv_drops_row_with_too_few_columns(read):
+def test_read_position_file_drops_row_with_too_few_columns(read):
     lines = table(PLAIN).splitlines(keepends=True)
     lines[30] = UNIX_S[29] + ",1.0\n"
     file = read("".join(lines))
@@ -363,7 +366,7 @@ def test_read_position_csv_drops_row_with_too_few_columns(read):
     assert_stated(file, "dropped rows without valid time or position: 1")
 
 
-def test_read_position_csv_drops_last_line_without_line_feed(read):
+def test_read_position_file_drops_last_line_without_line_feed(read):
     """The last line may be incomplete, also in its last digits."""
     file = read(table(PLAIN)[:-2])
     assert_track(file, rows=slice(-1))
@@ -377,7 +380,7 @@ def test_read_position_csv_drops_last_line_without_line_feed(read):
     ({10: 3_600_000_000, 40: -60_000_000}, [10, 40]),
     ({0: 10**15}, [0]),
 ])  # fmt: skip
-def test_read_position_csv_drops_backward_timestamps(read, shifts_us, dropped):
+def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
     stamps = UNIX_US + TIME_US
     for at, shift in shifts_us.items():
         stamps[at] += shift
@@ -390,9 +393,12 @@ def test_read_position_csv_drops_backward_timestamps(read, shifts_us, dropped):
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_read_position_csv_with_several_tags_adds_note(read, name):
-    file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
-    assert_stated(file, "the position file contains 2 tags (such as 'A1')")
+def test_read_position_file_with_two_tags_requires_body(read, name):
+    text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
+    assert "contains the bodies A1, B2. Choose one with --body." in error_message(read, text)
+    assert_track(read(text, body="B2"), rows=slice(1, None, 2))
+    assert "contains the bodies A1, B2" in error_message(read, text, body="C3")
+    assert "one body, without a name" in error_message(read, table(PLAIN), body="C3")
 
 
 # -- the options -----------------------------------------------------------------------------------
@@ -412,10 +418,10 @@ MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
     (BY_NAME, ("t", "north_mm", "east_mm", "up_mm"), "enu"),  # frame from the column names
     (MISNAMED, ("1", "2", "3", "4"), None),
 ])  # fmt: skip
-def test_read_position_csv_columns_option_selects_columns(read, given, columns, frame):
+def test_read_position_file_columns_option_selects_columns(read, given, columns, frame):
     file = read(PREAMBLE + table(given), columns=columns)
     assert_track(file)
-    assert file.frame == frame
+    assert file.frames == ((frame,) if frame else ())
     sigma = SIGMA_M if len(columns) == 5 else np.full(ROWS, np.nan)
     np.testing.assert_allclose(file.samples["sigma_y_m"], sigma)
 
@@ -431,14 +437,14 @@ def test_read_position_csv_columns_option_selects_columns(read, given, columns, 
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
     ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
 ])  # fmt: skip
-def test_read_position_csv_with_invalid_option_raises_error(read, options, words):
+def test_read_position_file_with_invalid_option_raises_error(read, options, words):
     with pytest.raises(SettingsError) as caught:
         read(table(PLAIN), **options)
     assert words in str(caught.value)
     assert_one_line(caught.value)
 
 
-def test_read_position_csv_names_missing_column_in_error(read):
+def test_read_position_file_names_missing_column_in_error(read):
     line = error_message(read, table(PLAIN), columns=("time", "x", "y", "w"))
     assert "no header with the columns 'time', 'w', 'x', 'y'" in line
 
@@ -448,15 +454,14 @@ def test_read_position_csv_names_missing_column_in_error(read):
 
 @pytest.mark.parametrize(("content", "words"), [
     (b"", "empty"),
-    (table(PLAIN, separator=";", decimal=","), "0 usable rows, fewer than 3; number of"),
     ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
     (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
-    ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
+    ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "is a PX4 ULog, not"),
     (b"1,2\n" * 50_000 + b"\0\n1,2\n", "binary"),
     (b"Dear all,\nplease find attached\nthe log.\n", "The first line is 'Dear all,'"),
     (b"a" * 40 + b"\nb\n", f"The first line is '{'a' * 40}'"),
     (b"a" * 41 + b"\nb\n", f"The first line is '{'a' * 37}...'"),
-    (table(PLAIN, header=False), "Name the columns with"),
+    (table({"x": X, **PLAIN}, header=False), "usable rows"),
     (table({"when": UNIX_S, "x": X, "y": Y}), "The first line is 'when,x,y'"),
     (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
     (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
@@ -465,14 +470,14 @@ def test_read_position_csv_names_missing_column_in_error(read):
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip
-def test_read_position_csv_of_unreadable_file_raises_log_error(read, content, words):
+def test_read_position_file_of_unreadable_file_raises_log_error(read, content, words):
     line = error_message(read, content)
     assert words in line
     assert line.startswith("uwb.csv")
 
 
-def test_read_position_csv_rejects_too_large_file(read, monkeypatch):
-    monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
+def test_read_position_file_rejects_too_large_file(read, monkeypatch):
+    monkeypatch.setattr(position_file, "MAX_FILE_BYTES", 1000)
     assert "MB, more than the limit of" in error_message(read, table(PLAIN))
 
 
@@ -499,7 +504,7 @@ def check_any(read, content: bytes) -> None:
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
 )
-def test_read_position_csv_of_repeated_characters_ends_fast(read, line):
+def test_read_position_file_of_repeated_characters_ends_fast(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):
@@ -514,11 +519,11 @@ def test_read_position_csv_of_repeated_characters_ends_fast(read, line):
 @pytest.mark.parametrize(("pattern", "time", "count"), [
     ("dwm1001__tag__*position.csv", "bag_time", 3), ("vrpn*.csv", "header_stamp", 2),
 ])  # fmt: skip
-def test_read_position_csv_of_real_uwb_file_keeps_its_values(pattern, time, count):
+def test_read_position_file_of_real_uwb_file_keeps_its_values(pattern, time, count):
     paths = sorted(shared("uwb").glob(f"*/{pattern}"))
     assert len(paths) == count
     for path in paths:
-        file = read_position_csv(path)
+        file = read_position_file(path)
         # Read as text first, because the conversion of pandas may differ in the last bit
         truth = pd.read_csv(path, dtype=str).astype(np.float64)
         truth = truth[truth[["v0", "v1", "v2"]].notna().all(axis=1)]

@@ -1,42 +1,65 @@
-"""Reader of CSV files from positioning systems (UWB), in the clock and frame of the file.
+"""Reader of positions from positioning systems, in the clock and frame of the recording.
 
 The standard format is a header and the columns ``time, x, y, z`` in seconds and metres, optionally
-``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other separators, column names and units are detected
-and reported. Options override the detected columns and units.
+``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other formats, separators, column names and units are
+detected and reported. Options override the detected columns and units.
 """
 
-import csv
 import hashlib
-import io
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, median_interval
-from px4fuse.core.reading import display_name, read_bytes_limited
+from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.core.reading import read_bytes_limited, split_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid, rounding_step
-from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
+from px4fuse.readers.formats import refuse_foreign_format
+from px4fuse.readers.position_names import (
+    LENGTH_UNITS,
+    TIME_UNITS,
+    ColumnMeaning,
+    find_quaternion,
+    read_column_name,
+)
+from px4fuse.readers.recording_table import (
+    COLUMNS_OPTION,
+    MAX_FILE_BYTES,
+    NO_HEADER,
+    SEPARATORS,
+    Table,
+    choose_body,
+    find_table,
+)
+from px4fuse.readers.ros_bag import is_bag, read_bag
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum file size (bytes): several days of UWB positions
-MAX_FILE_BYTES = 500_000_000
+# Maximum number of tags in a file: more values are a running number
+MAX_TAGS = 100
 MIN_ROWS = 3
+# Minimum fraction of usable rows of a table without header, and of whole seconds in a column beside
+# nanoseconds: fewer rows show that the columns have another meaning
+MIN_USABLE_SHARE = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
+# Units of times that are not UNIX time, and plausible median intervals (s), by is_trajectory: key
+# frames may have minutes between them, and ORB-SLAM3 writes nanoseconds
+PLAUSIBLE_TIMES = {
+    False: (tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)),
+    True: (("s", "ns"), (1e-3, 1e3)),
+}
 # Maximum median interval (s) of timestamps in UNIX time: boot times in µs can be equally large
 # numbers, but they have larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
@@ -44,13 +67,6 @@ MAX_UNIX_TIME_INTERVAL_S = 60.0
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
 MAX_COORDINATE = 1e9
-# Number of lines at the beginning of the file in which the header is searched
-MAX_HEADER_LINES = 1000
-# Number of characters at the beginning of the file in which the header is searched
-MAX_HEADER_CHARS = 200_000
-MAX_COLUMNS = 200
-_COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
-_SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 
 
 @dataclass(frozen=True)
@@ -71,8 +87,8 @@ class PositionRecording:
         matter.
     clock : "UNIX" or "local"
         "UNIX" if the timestamps are between 2000 and 2100.
-    frame : str or None
-        "ned" or "enu" according to the column names; None if they do not contain the frame.
+    frames : tuple of str
+        Frames that column names or format allow, such as ("ned",); empty if they contain none.
     detected : tuple of str
         One sentence per detected property of the format.
     notes : tuple of str
@@ -85,6 +101,12 @@ class PositionRecording:
         Rows without a measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
     step_m : float
         Rounding step of the coarsest horizontal coordinate; 0 if there is none.
+    format : str
+        Name of the format; "" for a table with a header.
+    row_count : int
+        Number of rows of the body in the file.
+    quaternions : ndarray or None
+        Orientation of each sample (x, y, z, w), shape (n, 4).
     """
 
     name: str
@@ -92,74 +114,37 @@ class PositionRecording:
     size_bytes: int
     samples: pd.DataFrame
     clock: Literal["UNIX", "local"]
-    frame: str | None
+    frames: tuple[str, ...]
     detected: tuple[str, ...]
     notes: tuple[str, ...]
     dropped: int = 0
     metres_per_unit: float = 1.0
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     step_m: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Table:
-    """Table in a text file: column names, and the text of the lines below the header (``body``)."""
-
-    file_name: str
-    separator: str
-    names: list[str]
-    body: str
-    header_line: int
-
-    def label(self, *columns: int | None) -> str:
-        """Join the names of columns for messages, without repeated columns and None."""
-        labels = dict.fromkeys(
-            quote(self.names[index]) if self.names[index] else f"column {index + 1}"
-            for index in columns
-            if index is not None
-        )
-        return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
-
-    def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of the columns as text, without rows in which all cells are empty."""
-        column_indices = sorted({*columns})
-        try:
-            texts = pd.read_csv(
-                io.StringIO(self.body),
-                sep=r"\s+" if self.separator == " " else self.separator,
-                header=None,
-                index_col=False,
-                names=range(column_indices[-1] + 1),
-                usecols=column_indices,
-                dtype=str,
-                skipinitialspace=True,
-                quoting=csv.QUOTE_NONE,
-            )
-        except ValueError as error:
-            raise LogError(
-                f"{self.file_name} contains no table of numbers",
-                "Export the positions as CSV again.",
-            ) from error
-        return texts.dropna(how="all")
+    format: str = ""
+    row_count: int = 0
+    quaternions: Array | None = None
 
 
 # Column indices of position or sigma along x, y, z; None if missing
 _Columns = tuple[int | None, ...]
 
 
-def read_position_csv(
+def read_position_file(
     path: str | Path,
     *,
     columns: tuple[str, ...] | None = None,
     time_unit: str | None = None,
     length_unit: str | None = None,
+    body: str | None = None,
+    is_trajectory: bool = False,
 ) -> PositionRecording:
-    """Read the position file of a positioning system.
+    """Read the recording of a positioning system.
 
     Parameters
     ----------
     path : str or Path
-        Text table, see :mod:`px4fuse.readers.position_csv`.
+        File, or ``FILE:BODY`` and ``BAG:TOPIC``.
     columns : tuple of str, optional
         Columns of time, x, y, z and optionally sigma, each a name or number (from 1). Without
         sigma, z may also be omitted.
@@ -167,6 +152,10 @@ def read_position_csv(
         Unit of the time column; overrides detection.
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas; overrides detection.
+    body : str, optional
+        Body or tag in the file, or topic of a ROS bag.
+    is_trajectory : bool
+        True to accept a large extent as metres, and to keep zeros and constant positions.
 
     Raises
     ------
@@ -177,17 +166,16 @@ def read_position_csv(
         An option has an invalid value or names a column that is not in the file.
     """
     _check_options(columns, time_unit, length_unit)
-    path = Path(path)
-    content = read_bytes_limited(
-        path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
-    )
-    table, notes = _find_table(display_name(path), content, columns)
+    path, part = split_part(str(path))
+    table, sha256, size_bytes = _open_table(path, columns, body or part)
+    notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
-    texts = table.texts(
-        [*chosen_columns, *(index for index, meaning in enumerate(meanings) if meaning.kind)]
+    quaternion_columns = find_quaternion(table.names)
+    numbers, has_zone = _read_numbers(
+        table, meanings, chosen_columns, quaternion_columns, body or part
     )
-    numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
+    row_count = len(numbers)
     time, position, sigma, frame, time_text = _choose_columns(
         table, meanings, chosen_columns, numbers
     )
@@ -196,86 +184,106 @@ def read_position_csv(
     has_time = np.isfinite(numbers[time])
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.insert(0, f"number of dropped rows without valid time or position: {unusable_count}")
+        notes.append(
+            f"number of dropped rows without valid time or position: {unusable_count}"
+            f"{table.first_line(numbers.index[~is_usable])}"
+        )
     empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
-    for tag in (index for index, meaning in enumerate(meanings) if meaning.kind == "tag"):
-        tags = sorted({*texts[tag].dropna()})
-        if tags[1:]:
-            notes.append(
-                f"the position file contains {len(tags)} tags (such as {quote(tags[0])}): remove "
-                "all tags but one"
-            )
     numbers = numbers[is_usable]
     times = numbers[time].to_numpy()
-    name_unit = meanings[time].unit
-    unit, unit_text = _time_unit(times, name_unit if name_unit in TIME_UNITS else "", time_unit)
-    units_per_second = round(1.0 / TIME_UNITS[unit])
+    name_unit = meanings[time].unit if meanings[time].unit in TIME_UNITS else ""
+    units, intervals_s = PLAUSIBLE_TIMES[is_trajectory]
+    unit, unit_text = _time_unit(times, name_unit, time_unit, units, intervals_s)
+    units_per_second: float = round(1.0 / TIME_UNITS[unit])
+    if table.rate_hz is not None:
+        units_per_second, unit_text = table.rate_hz, f"frames at {table.rate_hz:g} Hz"
     seconds = times / units_per_second
-    usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # Ranks are used instead of times, because longest_increasing_run requires positive values
-    ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
-    kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
+    kept_rows = _increasing_rows(seconds)
     if dropped := len(seconds) - len(kept_rows):
         notes.append(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
             f"{dropped}"
         )
-    if len(kept_rows) < MIN_ROWS:
+    is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_SHARE * row_count
+    if is_not_time or len(kept_rows) < MIN_ROWS:
         raise LogError(
-            "; ".join(
-                [
-                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
-                    f"{MIN_ROWS}",
-                    *notes,
-                ]
-            ),
-            f"Write numbers with decimal points, or name the columns with {_COLUMNS_OPTION}.",
+            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_ROWS}"
+            f"{''.join('; ' + note for note in notes)}",
+            f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
     median_interval_s = median_interval(numbers.index)
-    if not MIN_INTERVAL_S <= median_interval_s <= MAX_INTERVAL_S:
+    if not intervals_s[0] <= median_interval_s <= intervals_s[1]:
         notes.append(
-            f"a median interval of {median_interval_s:.3g} s is not plausible for UWB: check "
-            "the unit of time (--position-time-unit)"
+            f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
+            "(--position-time-unit)"
         )
-    scale_by_column, length_unit_text = _length_units(numbers, axes, meanings, length_unit)
+    max_extent_m = np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
+    scale_by_column, length_unit_text = _length_units(
+        numbers, axes, meanings, length_unit, max_extent_m
+    )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
         for name, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
+    if is_trajectory:
+        reason[:] = ""
     invalid = reason[reason != ""], pd.Series("NaN", empty_times / units_per_second)
+    quaternions = numbers.loc[reason == "", quaternion_columns].to_numpy()
     samples = samples[reason == ""]
-    is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
-    if bad_row_count := int(is_not_positive.any(axis=1).sum()):
-        notes.append(f"number of ignored sigmas that are zero or negative: {bad_row_count}")
-        samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
-    is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
+    notes += _drop_invalid_sigmas(samples)
+    is_unix = has_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axis_names = frame.upper() if frame else "x, y, z"
-    height_text = "" if len(axes) == 3 else " without height"
+    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (len(axes) < 3)
     return PositionRecording(
         name=table.file_name,
-        sha256=hashlib.sha256(content).hexdigest(),
-        size_bytes=len(content),
+        sha256=sha256,
+        size_bytes=size_bytes,
         samples=samples,
         clock=clock,
-        frame=frame,
+        frames=(frame,) if frame else table.frames,
         dropped=dropped,
         detected=(
-            f"the separator is {_SEPARATORS[table.separator]}, the header is line "
+            f"the format is {table.format}"
+            if table.format
+            else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
             f"time: column {time_text}, {clock} clock, unit {unit_text}",
-            f"position: columns {table.label(*position)} as {axis_names}{height_text}, "
-            f"unit {length_unit_text}",
+            f"position: columns {table.label(*position)} as {axes_text}, unit {length_unit_text}",
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
         metres_per_unit=scale_by_column[axes[0]],
         invalid=pd.concat(invalid).sort_index(),
+        format=table.format,
+        row_count=row_count,
+        quaternions=quaternions if quaternion_columns else None,
         step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
+
+
+def _open_table(
+    path: Path, columns: tuple[str, ...] | None, body: str | None
+) -> tuple[Table, str, int]:
+    """Return the table of a file or bag, with SHA-256 and size (bytes)."""
+    if is_bag(path):
+        return read_bag(path, body)
+    content = read_bytes_limited(
+        path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
+    )
+    refuse_foreign_format(path, content, LogError)
+    table = find_table(path, content, columns, body)
+    return table, hashlib.sha256(content).hexdigest(), len(content)
+
+
+def _increasing_rows(seconds: Array) -> IntArray:
+    """Return the indices of rows whose times increase and are before 2100."""
+    usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
+    # Ranks are used instead of times, because longest_increasing_run requires positive values
+    ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
+    return usable_rows[longest_increasing_run(ranks + 1)]
 
 
 def _check_options(
@@ -291,73 +299,72 @@ def _check_options(
     names = columns or ("1", "2", "3")
     if "" in names or not 3 <= len({*names}) == len(names) <= 5:
         raise SettingsError(
-            f"{_COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name four or five different "
+            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name four or five different "
             "columns (three without height)."
         )
 
 
-def _split_line(line: str, separator: str) -> list[str]:
-    if separator == " ":  # a name with unit, such as "x [mm]", is one field
-        return re.sub(r" +(?=[\[(])", "", line.strip()).split()
-    return [field.strip() for field in line.split(separator)]
+def _read_numbers(
+    table: Table,
+    meanings: list[ColumnMeaning],
+    chosen_columns: list[int],
+    quaternion_columns: list[int],
+    body: str | None,
+) -> tuple[pd.DataFrame, bool]:
+    """Read columns as numbers; also return False if ISO 8601 times lack the time zone.
 
-
-def _find_table(
-    file_name: str, content: bytes, columns: tuple[str, ...] | None
-) -> tuple[_Table, list[str]]:
-    """Find the table in a text file.
-
-    Also return a list with a note if an incomplete last line was dropped.
+    The unit of columns with ISO 8601 times becomes "s" in ``meanings``.
     """
-    text = decode_text(content)
-    if text is None:
-        raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
-    notes = []
-    whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
-    text = f"{whole_lines}\n"
-    if last_line.strip():
-        notes.append("the last line of the position file was dropped, because it has no line end")
-    lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
-    wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
-    headers = (
-        (index + 1, separator, names)
-        for index, header_line in enumerate(lines)
-        for separator in _SEPARATORS
-        for names in [_split_line(header_line.strip("#% "), separator)]
-        if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names)
-    )
-    header_line, separator, names = next(headers, (0, "", []))
-    if not names:
-        title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
-        raise LogError(
-            f"{file_name}: the first {len(lines)} lines contain no header with the columns "
-            f"{title_list}. The first line is {quote(lines[0])}.",
-            f"Name the columns with {_COLUMNS_OPTION}.",
-        )
-    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", header_line)[header_line])
-    first_row = body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
-    row_width = len(_split_line(first_row, separator))
-    if row_width > len(names):
-        raise LogError(
-            f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
-            "Write numbers with decimal points, and give each column a name.",
-        )
-    return _Table(file_name, separator, names, body, header_line), notes
+    named_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
+    texts = table.texts([*chosen_columns, *quaternion_columns, *named_columns])
+    texts = _select_body(table, texts, meanings, body)
+    numbers = texts.apply(_to_numbers, is_comma_decimal=table.separator != ",")
+    has_zone = True
+    for index in chosen_columns[:1] or [i for i in named_columns if meanings[i].kind == "time"]:
+        if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
+            numbers[index], has_zone = _read_dates(texts[index])
+            meanings[index] = replace(meanings[index], unit="s")
+    return numbers, has_zone
 
 
-def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
-    """Return True if the fields of a line are a header: they contain all wanted names.
-
-    Without wanted names, a header contains names of time and position.
-    """
-    if wanted_names:
-        return wanted_names <= {name.casefold() for name in fields}
-    meanings = [read_column_name(name) for name in fields]
-    has_time = any(column.kind == "time" for column in meanings)
-    return has_time and position_names.find_position(meanings) is not None
+def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
+    """Replace zero and negative sigmas by NaN, and return a note on them."""
+    is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
+    samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
+    count = int(is_not_positive.any(axis=1).sum())
+    return [f"number of ignored sigmas that are zero or negative: {count}"] if count else []
 
 
-def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
+def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Series[float]":
+    """Convert texts to numbers; a comma is the decimal mark if most cells contain one."""
+    if is_comma_decimal and texts.str.contains(",", regex=False).mean() > 0.5:
+        texts = texts.str.replace(",", ".", regex=False)
+    return pd.to_numeric(texts, errors="coerce").astype(np.float64)
+
+
+def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
+    """Convert ISO 8601 times to seconds since 1970; also return False if they lack the zone."""
+    texts = texts.str.replace(",", ".", regex=False)
+    dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
+    seconds = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return seconds, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
+
+
+def _select_body(
+    table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body: str | None
+) -> pd.DataFrame:
+    """Return the rows of one tag, if a column contains the tags of several bodies."""
+    for index, meaning in enumerate(meanings):
+        if meaning.kind == "tag":
+            tags = texts[index].dropna().unique().tolist()
+            if 1 < len(tags) <= MAX_TAGS or (tags and body is not None):
+                return texts[texts[index] == choose_body(table.file_name, tags, body)]
+    if body is not None and not table.is_one_body:
+        raise LogError(f"{table.file_name} contains one body, without a name", "Omit its name.")
+    return texts
+
+
+def _column_indices(table: Table, columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
     numbers = [str(index + 1) for index in range(len(names))]
     indices = []
@@ -367,18 +374,16 @@ def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
             raise SettingsError(
                 f"{table.file_name} has no column {quote(column)}; the columns are "
                 f"{table.label(*range(len(names)))}",
-                f"Name the columns with {_COLUMNS_OPTION}.",
+                f"Name the columns with {COLUMNS_OPTION}.",
             )
         indices.append((names if wanted_name in names else numbers).index(wanted_name))
     if len({*indices}) < len(indices):
-        raise SettingsError(
-            f"{_COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice."
-        )
+        raise SettingsError(f"{COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice.")
     return indices
 
 
 def _choose_columns(
-    table: _Table,
+    table: Table,
     meanings: Sequence[ColumnMeaning],
     chosen_columns: list[int],
     numbers: pd.DataFrame,
@@ -407,9 +412,20 @@ def _choose_columns(
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
         rank = position_names.TIME_KINDS.index
         time, *other_times = sorted(
-            time_columns, key=lambda index: (is_mostly_empty[index], rank(meanings[index].key))
+            time_columns,
+            key=lambda index: (
+                is_mostly_empty[index],
+                rank(meanings[index].key),
+                meanings[index].unit == "ns",
+            ),
         )
         time_text = table.label(time)
+        for index in other_times:
+            are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_SHARE
+            if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
+                numbers[time] += numbers[index] * 1e-9
+                other_times = [other for other in other_times if other != index]
+                time_text += f" plus {table.label(index)}"
         if other_times:
             time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
         frame, position = position_names.find_position(meanings) or (None, ())
@@ -423,8 +439,18 @@ def _choose_columns(
     return time, position, sigma, frame, time_text
 
 
-def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, str]:
-    """Return the unit of the time column, and a text with the reason for this unit."""
+def _time_unit(
+    times: Array,
+    name_unit: str,
+    option: str | None,
+    units: Container[str],
+    intervals_s: tuple[float, float],
+) -> tuple[str, str]:
+    """Return the unit of the time column, and a text with the reason for this unit.
+
+    Units other than ``units`` are for UNIX times only; ``intervals_s`` are the plausible median
+    intervals.
+    """
     if option is not None:
         return option, f"{option} (given with --position-time-unit)"
     median = float(np.median(times)) if len(times) else 0.0
@@ -437,7 +463,7 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, f"{unit} (because the times are then UNIX times)"
-        if MIN_INTERVAL_S <= median_step * scale <= MAX_INTERVAL_S:
+        if unit in units and intervals_s[0] <= median_step * scale <= intervals_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
@@ -456,7 +482,11 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
 
 
 def _length_units(
-    numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
+    numbers: pd.DataFrame,
+    axes: list[int],
+    meanings: Sequence[ColumnMeaning],
+    option: str | None,
+    max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
     """Return metres per unit of each column, and a text with the unit of the positions."""
     name_units = {
@@ -476,13 +506,13 @@ def _length_units(
     elif axis_units := [name_units[index] for index in axes if index in name_units]:
         unit = axis_units[0]
         reason = "from the column names"
-    elif MAX_INDOOR_EXTENT_M < max_extent <= MAX_INDOOR_EXTENT_M / LENGTH_UNITS["mm"]:
+    elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
             f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
             "cm, give --position-unit"
         )
-    elif max_extent > MAX_INDOOR_EXTENT_M:
+    elif max_extent > max_extent_m:
         reason = (
             "assumed, because no unit gives the extent of an indoor flight; set another unit with "
             "--position-unit"

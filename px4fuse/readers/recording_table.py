@@ -1,0 +1,367 @@
+"""Tables in recordings of positions: each format is converted to columns with names.
+
+A table with a header is found by its column names. Other formats are recognised by their
+structure: group headers of Motive and Vicon Nexus, JSON lines, KITTI matrices, tables without a
+header, and the streams of ``formats.toml``.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from px4fuse.core.reading import display_name, read_text
+from px4fuse.errors import LogError
+from px4fuse.readers import position_names
+from px4fuse.readers.formats import STREAMS
+from px4fuse.readers.position_names import read_column_name
+from px4fuse.readers.text_table import decode_text, is_number, quote
+
+# Maximum size (bytes) of a recording: several days of UWB positions
+MAX_FILE_BYTES = 500_000_000
+# Number of lines at the beginning of the file in which the header is searched
+MAX_HEADER_LINES = 1000
+# Number of characters at the beginning of the file in which the header is searched
+MAX_HEADER_CHARS = 200_000
+MAX_COLUMNS = 200
+COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
+SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
+NO_HEADER = "table without header"
+_ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table in a recording.
+
+    Attributes
+    ----------
+    file_name : str
+    format : str
+        Name of the format; "" for a table with a header.
+    names : list of str
+        Column names.
+    body : str
+        Text of the lines below the header.
+    separator : str
+    header_line : int or None
+        Line number of the header; 0 without a header, None if rows are not lines of the file.
+    frames : tuple of str
+        Frames that the format may have; empty for all.
+    rate_hz : float or None
+        Rate of the frame numbers that are in the time column; None for times.
+    is_one_body : bool
+        True if the columns belong to one body that was chosen from several.
+    notes : tuple of str
+    """
+
+    file_name: str
+    format: str
+    names: list[str]
+    body: str
+    separator: str = ","
+    header_line: int | None = None
+    frames: tuple[str, ...] = ()
+    rate_hz: float | None = None
+    is_one_body: bool = False
+    notes: tuple[str, ...] = ()
+
+    def label(self, *columns: int | None) -> str:
+        """Join the names of columns for messages, without repeated columns and None."""
+        labels = dict.fromkeys(
+            quote(self.names[index]) if self.names[index] else f"column {index + 1}"
+            for index in columns
+            if index is not None
+        )
+        return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
+
+    def first_line(self, rows: pd.Index) -> str:
+        """Format the line number of the first of some rows; "" if rows are not lines."""
+        return (
+            "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
+        )
+
+    def texts(self, columns: Iterable[int]) -> pd.DataFrame:
+        """Return the cells of the columns as text, without rows in which all cells are empty."""
+        column_indices = sorted({*columns})
+        try:
+            texts = pd.read_csv(
+                io.StringIO(self.body),
+                sep=r"\s+" if self.separator == " " else self.separator,
+                header=None,
+                index_col=False,
+                names=range(column_indices[-1] + 1),
+                usecols=column_indices,
+                dtype=str,
+                skipinitialspace=True,
+                quoting=csv.QUOTE_NONE,
+                skip_blank_lines=False,  # the index counts the lines
+            )
+        except ValueError as error:
+            raise LogError(
+                f"{self.file_name} contains no table of numbers",
+                "Export the positions as CSV again.",
+            ) from error
+        return texts.dropna(how="all")
+
+
+def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) -> str:
+    """Return the body to use: the wanted one, or the only one of the file.
+
+    Vicon Nexus repeats the name of the subject, as in ``drone:drone``.
+
+    Raises
+    ------
+    LogError
+        The file contains several bodies and none is wanted, or it does not contain the wanted one.
+    """
+    names = [*dict.fromkeys(bodies)]
+    matches = names if wanted_body is None else [name for name in names if name == wanted_body]
+    matches = matches or [name for name in names if name.partition(":")[0] == wanted_body]
+    if len(matches) == 1:
+        return matches[0]
+    raise LogError(
+        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose one with --body."
+    )
+
+
+def find_table(
+    path: Path, content: bytes, columns: tuple[str, ...] | None, body: str | None
+) -> Table:
+    """Find the table of positions in a recording.
+
+    Parameters
+    ----------
+    path : Path
+        Path of the recording; times of KITTI poses are read from a file in the same folder.
+    content : bytes
+    columns : tuple of str or None
+        Names or numbers of the columns that the header must contain.
+    body : str or None
+        Body to choose from group headers.
+
+    Raises
+    ------
+    LogError
+        The content is not a text, or contains no table of positions.
+    """
+    file_name = display_name(path)
+    text = decode_text(content)
+    if text is None:
+        raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
+    notes = []
+    whole_lines, _, last_line = text.rpartition("\n")
+    text = f"{whole_lines}\n"
+    if _is_complete(last_line, whole_lines.rpartition("\n")[2]):
+        text += f"{last_line}\n"
+    elif last_line.strip():
+        notes.append("the last line of the position file was dropped, because it has no line end")
+    found = None if columns else _find_json(file_name, text)
+    text = text.replace('"', "")
+    lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
+    if columns is None and found is None:
+        found = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
+    wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
+    if found is None:
+        found = _find_header(file_name, text, lines, wanted_names)
+    if found is None and not wanted_names:
+        found = _find_numbers(path, text, lines)
+    if found is None:
+        title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
+        raise LogError(
+            f"{file_name}: the first {len(lines)} lines contain no header with the columns "
+            f"{title_list}. The first line is {quote(lines[0])}.",
+            f"Add a header such as time,x,y,z, or name the columns with {COLUMNS_OPTION}.",
+        )
+    first_row = found.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+    row_width = len(_split_line(first_row.rstrip(f"{found.separator} "), found.separator))
+    if row_width > len(found.names):
+        raise LogError(
+            f"{file_name}: the header has {len(found.names)} columns, but the rows have "
+            f"{row_width}.",
+            "Write numbers with decimal points, and give each column a name.",
+        )
+    return replace(found, notes=(*found.notes, *notes))
+
+
+def _is_complete(line: str, line_before: str) -> bool:
+    """Return True if a line without line end has the columns and decimals of the one before."""
+    cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
+    decimals, decimals_before = (one[-1].partition(".")[2] for one in (cells, cells_before))
+    return "." in line and len(cells) == len(cells_before) and len(decimals) >= len(decimals_before)
+
+
+def _split_line(line: str, separator: str) -> list[str]:
+    if separator == " ":  # a name with unit, such as "x [mm]", is one field
+        return re.sub(r" +(?=[\[(])", "", line.strip()).split()
+    return [field.strip() for field in line.split(separator)]
+
+
+def _find_header(
+    file_name: str, text: str, lines: Sequence[str], wanted_names: set[str]
+) -> Table | None:
+    """Find the first line that names time and position, or contains the wanted names."""
+    for index, line in enumerate(lines):
+        for separator in SEPARATORS:
+            names = _split_line(line.strip("#% "), separator)
+            if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names):
+                body = _without_comments(text.split("\n", index + 1)[index + 1])
+                return Table(file_name, "", names, body, separator, index + 1)
+    return None
+
+
+def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
+    if wanted_names:
+        return wanted_names <= {name.casefold() for name in fields}
+    meanings = [read_column_name(name) for name in fields]
+    has_time = any(column.kind == "time" for column in meanings)
+    return has_time and position_names.find_position(meanings) is not None
+
+
+def _find_groups(
+    file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
+) -> Table | None:
+    """Find the columns of one body below the group headers of Motive or Vicon Nexus."""
+    header = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
+    rows = [_split_line(line, ",") for line in lines[: header + 2]]
+    is_motive = header >= 3 and rows[0][0] == "Format Version"
+    if header < 3 or not (is_motive or is_number(rows[1][0])):
+        return None
+    axes, body = rows[header], text.split("\n", header + 1)[header + 1]
+    rows = [row + [""] * (len(axes) - len(row)) for row in rows]
+    if is_motive:
+        unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
+        row_by_title = {row[1]: row for row in rows[2:header]}
+        owners, kinds = (row_by_title.get(title, axes) for title in ("Name", "Type"))
+        used_kinds = {"Rigid Body"} if "Rigid Body" in kinds else {*kinds}
+        # Rotations are not read, because the axes of a rigid body are not those of the vehicle
+        names = [
+            f"{axis}_{unit}" if group == "Position" and kind in used_kinds else ""
+            for axis, group, kind in zip(axes, rows[header - 1], kinds, strict=False)
+        ]
+    else:
+        owners = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
+        names = [
+            f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
+            for axis, unit in zip(axes, rows[header + 1], strict=False)
+        ]
+        body = re.split(r"\n[, ]*\n", body.partition("\n")[2], maxsplit=1)[0] + "\n"
+    owners_with_position = (owner for owner, name in zip(owners, names, strict=False) if name)
+    chosen = choose_body(file_name, owners_with_position, wanted_body)
+    names = [name * (owner == chosen) for owner, name in zip(owners, names, strict=False)]
+    names[:2] = axes[:2] if is_motive else ["time", ""]
+    return Table(
+        file_name,
+        "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
+        names,
+        body,
+        header_line=header + 1,
+        # Motive exports y up by default, and z up by an option that the file does not contain
+        frames=("eus", "enu") if is_motive else (),
+        rate_hz=None if is_motive else float(rows[1][0]),
+        is_one_body=True,
+        notes=(f"the body is {quote(chosen)}",),
+    )
+
+
+def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
+    """Convert the lines of a stream that contain a position."""
+    for stream in STREAMS:
+        pattern = re.compile(stream["row"], re.MULTILINE)
+        first_row = next((line for line in lines if pattern.match(line)), None)
+        if first_row is not None:
+            rows = pattern.findall(text)
+            range_count = len(re.findall(stream["ranges"], first_row))
+            notes = [f"not used: {range_count} ranges beside each position"]
+            if lost_count := text.count("\n") - len(rows):
+                notes.append(f"lines without a position: {lost_count}")
+            body = "".join(f"{','.join(row)}\n" for row in rows)
+            return Table(file_name, stream["name"], [*pattern.groupindex], body, notes=tuple(notes))
+    return None
+
+
+def _find_json(file_name: str, text: str) -> Table | None:
+    """Convert JSON lines; names are the paths of the values, such as ``data.coordinates.x``."""
+    if not text.lstrip().startswith(("{", "[{")):
+        return None
+    try:
+        values = msgspec.json.Decoder().decode_lines(text)
+    except msgspec.DecodeError as error:
+        raise LogError(f"{file_name} contains invalid JSON ({error})", "Record it again.") from None
+    records = [
+        record for value in values for record in (value if isinstance(value, list) else [value])
+    ]
+    columns = pd.json_normalize(records)
+    paths = [path for path in map(str, columns) if read_column_name(path).kind]
+    is_pozyx = "data.coordinates.x" in paths
+    return Table(
+        file_name,
+        "Pozyx JSON stream" if is_pozyx else "JSON lines",
+        [path + "_mm" * (is_pozyx and ".coordinates." in path) for path in paths],
+        columns[paths].to_csv(index=False, header=False),
+    )
+
+
+def _find_numbers(path: Path, text: str, lines: Sequence[str]) -> Table | None:
+    """Read a table without header as time, x, y, z, or as the matrices of KITTI."""
+    plain_lines = (line.partition("#")[0] for line in lines)
+    first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
+    for separator in SEPARATORS:
+        fields = _split_line(first_row, separator)
+        decimals = [field.replace(",", ".") for field in fields]
+        if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimals[1:])):
+            continue
+        is_time = is_number(decimals[0]) or _ISO_DATE.match(fields[0])
+        if separator == " " and len(fields) == 12:
+            return _kitti_table(path, text)
+        if is_time:
+            name, order = NO_HEADER, ""
+            if separator in " \t" and len(fields) == 8:
+                name, order = "TUM trajectory", "xyzw"
+            elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
+                name, order = "EuRoC ground truth", "wxyz"
+            names = ["time", "x", "y", "z", *(f"q{axis}" for axis in order)]
+            names += [""] * (len(fields) - len(names))
+            note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
+            body = _without_comments(text)
+            return Table(display_name(path), name, names, body, separator, 0, notes=(note,))
+    return None
+
+
+def _without_comments(text: str) -> str:
+    return re.sub(r"(?m)[ \t]*#.*|^[ \t]*%.*", "", text)
+
+
+def _kitti_table(path: Path, text: str) -> Table:
+    """Read the rows of 3x4 matrices, and the times from a file in the same folder."""
+    # imported on demand, as most recordings need no rotations
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    name, times_name = display_name(path), f"{path.stem}_times.txt"
+    paths = (path.with_name(times_name), path.with_name("times.txt"))
+    times_path = next((times_path for times_path in paths if times_path.is_file()), None)
+    if times_path is None:
+        raise LogError(
+            f"{name}: the file contains KITTI poses, which have no times",
+            f"Save the times (s), one per line, as {display_name(paths[0])} in the same folder.",
+        )
+    times = read_text(times_path, LogError, MAX_FILE_BYTES).split()
+    try:
+        matrices = np.loadtxt(io.StringIO(text), ndmin=2)
+        quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 4)[:, :, :3]).as_quat()
+        cells = np.column_stack([np.array(times, dtype=float), matrices[:, 3::4], quaternions])
+    except ValueError as error:
+        raise LogError(
+            f"{name}: the KITTI poses or the times in {display_name(times_path)} are not valid",
+            "Export both again.",
+        ) from error
+    names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    note = f"the times are from {display_name(times_path)}"
+    body = pd.DataFrame(cells).to_csv(index=False, header=False)
+    return Table(name, "KITTI poses", names, body, frames=("edn",), notes=(note,))

@@ -1,0 +1,160 @@
+"""Positions in ROS bags: bags of ROS 1 and 2 (SQLite, MCAP), read with the library rosbags."""
+
+import hashlib
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from px4fuse.core.reading import (
+    LOG_SIZE_REMEDY,
+    display_name,
+    file_size,
+    files_below,
+    format_size_limit,
+    max_log_bytes,
+)
+from px4fuse.errors import LogError
+from px4fuse.readers.recording_table import Table
+
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_PATH = "nav_msgs/msg/Path"
+_FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
+_POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
+
+
+# Messages with a position; VehicleOdometry also has the frame
+_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "geometry_msgs/msg/PointStamped",
+    "nav_msgs/msg/Odometry",
+    _PATH,
+    "px4_msgs/msg/VehicleOdometry",
+)
+
+
+def _values(message: Any) -> list[float]:
+    """Return x, y, z and, if the message contains them, qx, qy, qz, qw and the σ of x, y and z."""
+    if hasattr(message, "q"):
+        return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
+    pose = getattr(message, "pose", None) or getattr(message, "transform", message)
+    covariance = getattr(pose, "covariance", None)
+    pose = getattr(pose, "pose", pose)
+    vectors = [
+        getattr(pose, name)
+        for name in ("point", "position", "translation", "orientation", "rotation")
+        if hasattr(pose, name)
+    ]
+    values = [
+        getattr(vector, axis) for vector in vectors for axis in "xyzw" if hasattr(vector, axis)
+    ]
+    if covariance is not None:
+        values += np.sqrt(np.where(covariance > 0.0, covariance, np.nan)[[0, 7, 14]]).tolist()
+    return values
+
+
+def is_bag(path: Path) -> bool:
+    """Return True for the folder of a ROS 2 bag, or a file with the suffix of a bag."""
+    return (path / "metadata.yaml").exists() or path.suffix.lower() in _SUFFIXES
+
+
+def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
+    """Read the poses of one topic of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        File, or folder of a ROS 2 bag.
+    topic : str or None
+        Topic to read; None for the only topic with positions.
+
+    Returns
+    -------
+    table : Table
+        Times of the message headers, positions, orientations and sigmas.
+    sha256 : str
+        SHA-256 of the files of the bag.
+    size_bytes : int
+
+    Raises
+    ------
+    LogError
+        The library rosbags is not installed, the bag cannot be read or is too large, or the topic
+        is not one with positions.
+    """
+    name = display_name(path)
+    try:
+        # imported on demand, as only bags need this optional library
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ImportError:
+        raise LogError(
+            f"{name} is a ROS bag, and the library rosbags is not installed",
+            "Run pip install 'px4fuse[ros]'.",
+        ) from None
+    files = files_below(path) if path.is_dir() else [path]
+    size = sum(file_size(file, LogError) for file in files)
+    if size > max_log_bytes.get():
+        raise LogError(format_size_limit(name, size, max_log_bytes.get()), LOG_SIZE_REMEDY)
+    hashes = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                hashes.update(block)
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            return _read_topic(name, reader, topic), hashes.hexdigest(), size
+    except LogError:
+        raise
+    except Exception as error:  # rosbags raises many types for damaged bags
+        raise LogError(
+            f"{name}: the ROS bag cannot be read ({error})", "Repair it with ros2 bag reindex."
+        ) from error
+
+
+def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
+    type_by_topic = {one.topic: one.msgtype for one in reader.connections}
+    usable = [one for one, kind in type_by_topic.items() if kind in _TYPES]
+    chosen = usable[0] if topic is None and len(usable) == 1 else topic
+    if chosen not in usable:
+        raise LogError(
+            f"{name} contains these topics with positions: {', '.join(usable) or 'none'}",
+            f"Give one as {name}:TOPIC." if usable else "Record the positions as PoseStamped.",
+        )
+    kind = type_by_topic[chosen]
+    messages = reader.messages([one for one in reader.connections if one.topic == chosen])
+    if kind == _PATH:
+        messages = deque(messages, maxlen=1)  # each path repeats the poses of the previous one
+    lags_s, rows, frames = [], [], set()
+    for connection, receive_ns, raw in messages:
+        message = reader.deserialize(raw, connection.msgtype)
+        for stamped in message.poses if kind == _PATH else [message]:
+            time_ns = _time_ns(stamped)
+            frames.add(getattr(stamped, "pose_frame", None))
+            lags_s.append((receive_ns - time_ns) * 1e-9)
+            rows.append(f"{time_ns},{str(_values(stamped))[1:-1]}\n")
+    notes = [f"the topic is {chosen} ({kind})"]
+    if rows:
+        low, middle, high = np.percentile(lags_s, [2.5, 50.0, 97.5])
+        notes.append(
+            f"the timestamps in the messages are used; they were received {middle:.3f} s later "
+            f"(95 % {low:.3f} to {high:.3f} s)"
+        )
+    return Table(
+        name,
+        "ROS bag",
+        ["time_ns", *_POSE_COLUMNS[: rows[0].count(",") if rows else 3]],
+        "".join(rows),
+        is_one_body=True,
+        frames=("ned",) if frames == {_FRAME_NED} else (),
+        notes=tuple(notes),
+    )
+
+
+def _time_ns(message: Any) -> int:
+    if hasattr(message, "header"):
+        return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+    return int(message.timestamp_sample) * 1000
