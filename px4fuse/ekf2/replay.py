@@ -541,12 +541,13 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
     """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    columns = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
-    truth = flight.truth.samples.dropna(subset=columns)
-    if truth.empty:
+    samples = flight.truth.samples
+    component = signals.weighted_sum(samples, Columns.POSITION, direction)
+    is_known = np.isfinite(component)
+    if not is_known.any():
         return None
-    is_inside = (times >= truth.index[0]) & (times <= truth.index[-1])
-    error = (position - along(truth, Columns.POSITION, direction, times))[is_inside]
+    truth = np.interp(times, samples.index[is_known], component[is_known], np.nan, np.nan)
+    error = (position - truth)[np.isfinite(truth)]
     return rms(error) if len(error) else None
 
 
