@@ -138,6 +138,7 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     is_usable = is_inside & is_in_time
     is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses only the newer of two samples in one step
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
+    action[np.isin(stamp, received.reset_s) & (action == FUSE)] = START
     # additional events in gaps of the position source; their number does not depend on the delay
     gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
