@@ -76,6 +76,8 @@ MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # near the gate limit changes many later samples. Then only rejected fraction and mean NIS are
 # compared, and single innovations in another replay with logged rejections
 MANY_REJECTIONS_SHARE = 0.05
+# Minimum rejected fraction for blaming the resets in a log for a replay that does not agree with it
+MOSTLY_REJECTED_SHARE = 0.5
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
@@ -625,10 +627,17 @@ def with_logged_rejections(
     is_good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
     )
+    reason = f"with EKF2's logged rejections: {reason}"
+    if not is_good and agreement.rejected_fraction_logged > MOSTLY_REJECTED_SHARE:
+        reason = (
+            f"EKF2 rejected {agreement.rejected_fraction_logged:.0%} of the positions and used the "
+            "IMU, with a reset after each second. The log does not show which sample each reset "
+            "used. The frame of the source is probably wrong"
+        )
     return replace(
         logged_rejections_agreement if has_all_decisions else agreement,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,
-        reason=f"with EKF2's logged rejections: {reason}",
+        reason=reason,
     )
