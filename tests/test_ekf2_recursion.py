@@ -328,7 +328,8 @@ def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
 def at_rest(
     measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
-    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None, reset_s: Any = (), **settings: float,
+    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None,
+    reset_s: Any = (), **settings: float,
 ) -> SegmentRun:  # fmt: skip
     """Run a level vehicle at rest at the origin, measured at 10 Hz at these north positions."""
     count = 10 * (len(measured_m) + 1)
