@@ -1,4 +1,4 @@
-"""Position of the source's sensor relative to the IMU, from the motion in turns."""
+"""Lever arm from the IMU to the position sensor, from the motion of the sensor in turns."""
 
 import numpy as np
 
@@ -13,20 +13,21 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import to_matrix
 
-# Minimum lever arm (m) for a finding: twice the noise of good UWB
+# Minimum lever arm (m) for a finding: twice the noise of good UWB (0.1 m)
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
 MIN_ARM_SIGMAS = 2.5
-# Maximum residual in σ of a sample that is used
+# Maximum residual, in σ, of a sample that the next fit uses
 CLIPPED_SIGMAS = 3.0
-# Number of least squares fits with outlier removal
+# Number of successive least squares fits, each without the outliers of the previous fit
 ITERATIONS = 4
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, float, float] | None:
-    """Estimate the lever arm (m) of the position sensor that EKF2's parameters do not contain.
+    """Estimate the lever arm of the position sensor in addition to that of EKF2's parameters.
 
-    Returns the distances forward and right and their standard deviation; None if not significant.
+    Return the distances forward and right and their σ (m); None if the lever arm is not
+    significant.
     """
     inertial = read_inertial(flight)
     samples = track.samples[Columns.POSITION[:2]].dropna()
@@ -43,7 +44,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, flo
         is_used = is_used & source.is_valid
         excess = source.table - imu.table[:, :2, 0]
         rows, values = design[is_used].reshape(-1, design.shape[2]), excess[is_used].ravel()
-        # successive second differences overlap by twice the window
+        # second differences overlap over twice the window, so only these are independent
         count = len(values) * GRID_S / (2.0 * WINDOW_S)
         if count < 2 * rows.shape[1]:
             return None
@@ -53,7 +54,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, flo
         covariance = np.linalg.pinv(rows.T @ rows) * sigma_m**2 * len(values) / count
         sigma = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual < CLIPPED_SIGMAS * sigma_m
-        time_s = time_s + fit[2]  # fit[2] is the time by which the timestamps are early
+        time_s = time_s + fit[2]  # fit[2]: time (s) by which timestamps are early
     forward_m, right_m = fit[:2].tolist()
     is_significant = np.hypot(forward_m, right_m) > max(MIN_ARM_M, MIN_ARM_SIGMAS * sigma)
     return (forward_m, right_m, sigma) if is_significant else None

@@ -56,7 +56,8 @@ class BadAcceleration:
     def share(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set; None if it is not set.
 
-        Intervals are successive. The flag from the log is set to its value at the end.
+        Call this method for successive intervals: a flag that follows the log gets the logged value
+        at the end of the interval.
         """
         if len(self.logged_since_s):
             row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -80,7 +81,7 @@ class BadAcceleration:
             barometer samples before the event, and the larger one of GNSS height and GNSS velocity.
             NaN without a sample.
         """
-        # the latest innovations are valid until the next ones
+        # an innovation is valid until the next innovation of the same sensor
         gnss = previous_ratios[-1]
         pressure = np.full(len(gnss), np.nan)
         for ratio in previous_ratios[:-1]:

@@ -8,7 +8,7 @@ from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import TITLES, group_by_root
 
-# Key in Finding.evidence of the kind of cause, which re-runs with a change have shown
+# Key in Finding.evidence whose value is the kind of cause that re-runs of a filter have shown
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,17 +20,18 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white noise of the source over the measurement σ of a filter. It is
-# present only if the ratio is large; then the assumed σ is a separate fault
+# Key in Finding.evidence: ratio of the source's white noise to the measurement noise that a filter
+# assumes. Only a large ratio is stored; the assumed noise is then a separate fault
 WHITE_RATIO = "white_over_assumed"
-# Values of CAUSE in a finding about an aiding source: this and the position source are the same
-# sensor, or the mean innovation of the aiding source changes in flight
+# Values of CAUSE in a finding about an aiding source: it belongs to the same sensor as the
+# positions of KF, or its mean innovation changes in flight
 SENSOR, CHANGE = "the source's sensor", "change"
-# Kind of cause of ekf2_resets: each position reset follows a gap in the position source
+# Value of CAUSE in the finding ekf2_resets if each position reset follows a gap in the source
 GAP = "gap"
-# Key in Finding.evidence of findings about the convention of the source, which precede all others
+# Key in Finding.evidence of findings about axes, unit, clock or orientation of the source, which
+# precede all other findings
 CONVENTION = "convention"
-# Findings that precede all others, because no estimate from these positions is valid
+# Ids of findings after which no estimate from the positions is valid, so they precede all others
 UNUSABLE = (
     "source_is_ekf2_estimate",
     "source_two_senders",
@@ -42,7 +43,7 @@ UNUSABLE = (
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
-# Kind of cause of no_motion: the vehicle stayed on the ground
+# Value of CAUSE in the finding no_motion if the vehicle stayed on the ground
 GROUND = "never took off"
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
@@ -58,7 +59,7 @@ NOISES = frozenset(
         "process_noise_near_zero",
     )
 )
-# Findings that a cause explains, one per line: "id", or "id: kind of cause"
+# Effects of a finding, by its id; one effect per line: "id", or "id: value of CAUSE"
 CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
 RECORDING = frozenset(
     {
@@ -103,7 +104,8 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         groups = [group for group in groups if group not in effect_groups]
         for effect, *further_effects in effect_groups:
             cause_group += [replace(effect, caused_by=cause), *further_effects]
-        # kf_underconfident and kf_overconfident do not increase the severity of their cause
+        # the findings kf_underconfident and kf_overconfident do not increase the severity of a
+        # cause
         severities = (
             effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES
         )
@@ -113,13 +115,13 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def effect_ids(cause: str) -> tuple[str, ...]:
-    """Return the ids of the findings that a finding can cause, each once."""
+    """Return the ids of the findings that one finding can cause, without duplicates."""
     effects = CONSEQUENCES.get(cause, "").splitlines()
     return tuple(dict.fromkeys(effect.partition(":")[0] for effect in effects))
 
 
 def _report_rank(group: list[Finding]) -> int:
-    # gaps of the recording falsify estimated noises: RECORDING warnings precede NOISES errors
+    # gaps in the recording falsify noise estimates: warnings in RECORDING precede errors in NOISES
     cause = group[0]
     is_first = CONVENTION in cause.evidence or cause.id in (*UNUSABLE, *MISLEADING, WITHOUT)
     if is_first and cause.severity != "note":
