@@ -328,7 +328,8 @@ def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
 def at_rest(
     measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
-    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None, **settings: float,
+    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None,
+    reset_s: Any = (), **settings: float,
 ) -> SegmentRun:  # fmt: skip
     """Run a level vehicle at rest at the origin, measured at 10 Hz at these north positions."""
     count = 10 * (len(measured_m) + 1)
@@ -357,7 +358,11 @@ def at_rest(
     )  # fmt: skip
     exact = None if speed_m_s is None else np.zeros_like(speed_m_s)
     vision = replace(
-        vision, correction_m=correction_m, velocity_m_s=speed_m_s, velocity_variance_m2_s2=exact
+        vision,
+        correction_m=correction_m,
+        velocity_m_s=speed_m_s,
+        velocity_variance_m2_s2=exact,
+        reset_s=reset_s,
     )
     inputs = Inputs(
         effective_settings(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
@@ -369,6 +374,13 @@ def at_rest(
         inputs.settings, uses_logged_decisions=True, without=without or {}
     )
     return run_segment(inputs, segment, [configuration], [intervals])
+
+
+def test_new_reset_counter_resets_position_to_sample():
+    """The source jumps by 0.3 m, inside the gate, and announces it at 10.605 s."""
+    done = at_rest([0.0] * 5 + [0.3] * 15, reset_s=np.array([10.605]))
+    assert np.flatnonzero(done.reset[:, 0]).tolist() == [5]
+    np.testing.assert_allclose(done.state[6:, 0, 6], 0.3, atol=1e-6)
 
 
 def test_ekf2_replay_of_vehicle_at_rest_matches_kalman_filter():

@@ -201,6 +201,7 @@ def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, fac
         # vision beside GNSS: an offset origin and EKF2_GPS_P_NOISE as minimum noise are no faults
         ("eg1_base", {"ekf2_underconfident": "note"}),
         ("eg1_evp20", {"ekf2_underconfident": "error"}),
+        ("eg1_d0", {"ekf2_gps_delay_wrong": "warning"}),
     ],
 )
 def test_findings_of_flights_in_pairs_are_as_expected(
@@ -215,5 +216,8 @@ def test_findings_of_flights_in_pairs_are_as_expected(
         assert {found[i].severity for i in found if not i.startswith(of_kf)} == {"note"}
     if name == "g1_v01":
         assert "EKF2_GPS_V_NOISE" in found["ekf2_acceleration_bad"].remedy
+    assert ("ekf2_gps_delay_wrong" in found) == (name == "eg1_d0")
+    if name == "eg1_d0":  # the true delay is 110 ms
+        assert found["ekf2_gps_delay_wrong"].evidence["estimate_ms"] == pytest.approx(110.0, abs=15)
     if name == "eg1_evp20":
         assert "EKF2_EVP_NOISE to 0.1 m" in found["ekf2_underconfident"].remedy

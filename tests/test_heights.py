@@ -337,11 +337,13 @@ def test_ekf2_flag_for_bad_acceleration_follows_innovations() -> None:
     nan = np.nan
     segment = climbing(of_baro([10], [0.0]))
     flag = BadAcceleration(np.array([False, True]), 3.0, segment)
+    ratios = [np.full((2, 2), nan)]
 
     def event(time_s: float, barometer: list[float], gnss: float) -> list[float]:
         """Return the fraction of the 0.1 s before an event with the flag, then fuse samples."""
         share = flag.share(np.array([time_s - 0.1]), np.array([time_s]))
-        flag.update(np.array([time_s]), np.array([[one, one] for one in (*barometer, gnss)]))
+        ratios.append(np.array([[one, one] for one in (*barometer, gnss)]))
+        flag.update(np.array([time_s]), *ratios[-2:])
         return [0.0, 0.0] if share is None else share.tolist()
 
     # one sensor alone, or in the other direction, is not sufficient

@@ -8,17 +8,45 @@ import numpy as np
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, Noise
-from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
+# Values (ms) of EKF2_GPS_DELAY of the re-runs that estimate the delay of GNSS
+GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message
 TRANSMISSION_MS = 30.0
 # Step (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
+
+
+def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
+    """Estimate the delay of GNSS and its σ (ms), with vision that EKF2 also fuses as reference.
+
+    The delay minimises the NIS of GNSS position and velocity, summed over re-runs of EKF2 with
+    other values of EKF2_GPS_DELAY. Return None if EKF2 did not fuse vision and GNSS velocity, or if
+    the sum has no minimum.
+    """
+    received = model.inputs.received
+    if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
+        return None
+    nis_sums = []
+    for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
+        updates = replay.updates[inside_spans(replay.updates.index, model.flown.evaluated_s)]
+        nis = [
+            updates[f"innovation_{axis}_{unit}"] ** 2
+            / updates[f"innovation_variance_{axis}_{variance_unit}"]
+            for axis in ("north", "east")
+            for unit, variance_unit in (("m", "m2"), ("m_s", "m2_s2"))
+        ]
+        # the number of evaluated samples depends slightly on the delay
+        nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
+    curvature, slope, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
+    return (-0.5 * slope / curvature, curvature**-0.5) if curvature > 0.0 else None
 
 
 def ml_ekf2_parameters(

@@ -52,9 +52,6 @@ class BadAcceleration:
         self.logged_since_s, self.logged_until_s = np.append(time_s, np.inf)[edges].reshape(-1, 2).T
         self.since_s = np.full(len(follows_log), time_s[0])
         self.until_s = np.full(len(follows_log), time_s[0] + duration_s * float(is_logged[0]))
-        # latest innovations (√S) of barometer and GNSS, and the largest of these innovations
-        self.ratios = np.full((2, len(follows_log)), np.nan)
-        self.largest_ratio = 0.0
 
     def share(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set; None if it is not set.
@@ -72,21 +69,18 @@ class BadAcceleration:
         duration_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(duration_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
-    def update(self, time_s: Array, ratios: Array) -> None:
+    def update(self, time_s: Array, previous_ratios: Array, ratios: Array) -> None:
         """Update the modelled flag after all fusions of one event.
 
         Parameters
         ----------
         time_s : ndarray, shape (S,) or (1,)
             Time of the event.
-        ratios : ndarray, shape (k + 1, S)
-            State minus measurement (down) in √S: of the barometer samples before the event, and the
-            larger one of GNSS height and GNSS velocity. NaN without a sample.
+        previous_ratios, ratios : ndarray, shape (k + 1, S)
+            State minus measurement (down) in √S, at the previous event and at this event: of the
+            barometer samples before the event, and the larger one of GNSS height and GNSS velocity.
+            NaN without a sample.
         """
-        previous_ratios, self.ratios = self.ratios, ratios
-        previous_largest, self.largest_ratio = self.largest_ratio, np.fmax.reduce(ratios, axis=None)
-        if max(previous_largest, self.largest_ratio) <= MIN_LARGER_RATIO:
-            return
         # an innovation is valid until the next innovation of the same sensor
         gnss = previous_ratios[-1]
         pressure = np.full(len(gnss), np.nan)

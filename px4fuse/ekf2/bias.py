@@ -14,8 +14,6 @@ from px4fuse.core.arrays import Array, BoolArray
 BIAS_DENSITY = 0.13
 # Minimum variance (m²) of the sensor bias
 MIN_VARIANCE_M2 = 1e-8
-# Minimum measurement variance R (m²) in updates of the sensor bias
-MIN_NOISE_M2 = 1e-4
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
 # Maximum |mean| of test ratio times sign of the innovation: if it is larger, EKF2 multiplies the
@@ -33,17 +31,14 @@ class BiasEstimator:
     ----------
     value_m, variance_m2 : ndarray, shape (S,) or (S, k)
         Initial bias (it is added to innovations), and variance of the bias.
-    start_s : float
-        Time of the initial bias.
     step_s : float
         Prediction step of EKF2.
     """
 
-    def __init__(self, value_m: Array, variance_m2: Array, start_s: float, step_s: float) -> None:
+    def __init__(self, value_m: Array, variance_m2: Array, step_s: float) -> None:
         self.value_m = value_m
         self.variance_m2 = variance_m2
         self.mean_signed_ratio = np.zeros_like(value_m)
-        self.last_s = np.full_like(value_m, start_s)
         self.filter_weight = step_s / (TEST_RATIO_FILTER_S + step_s)
 
     def remove_bias(
@@ -51,8 +46,7 @@ class BiasEstimator:
         nu: Array,
         predicted_variance: Array,
         noise_m2: Array,
-        time_s: Array,
-        has_sample: BoolArray,
+        interval_s: Array,
         updates_bias: BoolArray,
         weight: Array | float = 1.0,
     ) -> tuple[Array, Array]:
@@ -62,29 +56,24 @@ class BiasEstimator:
         ----------
         nu, predicted_variance, noise_m2 : ndarray
             Innovation without the bias (m), HPH' and R (m²).
-        time_s, has_sample, updates_bias : ndarray
-            Per filter configuration: sample time, True with a sample, True to update the bias.
+        interval_s, updates_bias : ndarray
+            Per filter configuration: time (s) since the previous sample, or 0 if the bias is not
+            updated; True to update the bias.
         weight : float or ndarray, shape (S,)
             Number of samples that EKF2 fused per known sample.
         """
-        updates_now = has_sample & updates_bias
-        growth_s = (time_s - self.last_s) * updates_now
         has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
-        if has_offset.any():
-            growth_s = np.where(has_offset, RANDOM_WALK_FACTOR, 1.0) * growth_s
-        variance = np.minimum(
-            self.variance_m2 + BIAS_DENSITY**2 * growth_s, np.maximum(noise_m2, MIN_NOISE_M2)
-        )
+        density = np.where(has_offset, RANDOM_WALK_FACTOR * BIAS_DENSITY**2, BIAS_DENSITY**2)
+        variance = np.minimum(self.variance_m2 + density * interval_s, noise_m2)
         nu = nu + self.value_m
         R = noise_m2 + variance
-        S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
+        S = variance + (noise_m2 + predicted_variance) / weight
         ratio = nu * nu / (BIAS_GATE**2 * S)
-        K = variance / S * (updates_now & (ratio < 1.0))
+        K = variance / S * (updates_bias & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(variance - K * variance, MIN_VARIANCE_M2)
         change = np.copysign(np.minimum(ratio, 1.0), nu) + self.mean_signed_ratio
         self.mean_signed_ratio = self.mean_signed_ratio - (
-            self.filter_weight * weight * updates_now * change
+            self.filter_weight * weight * updates_bias * change
         )
-        self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

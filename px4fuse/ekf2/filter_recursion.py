@@ -516,12 +516,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             if inputs.rules.resets_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
         if heights is not None and bad_acceleration.models_flag:
-            ratios = heights.ratios(e)
             if has_sample[e] and has_speed:
-                velocity_ratio = -nu[:, DOWN_COLUMN] / np.sqrt(S[:, DOWN_COLUMN])
-                velocity_ratio[~can_fuse_velocity[e]] = np.nan
-                ratios[-1] = np.fmax(ratios[-1], velocity_ratio)
-            bad_acceleration.update(event_time_s[e], ratios)
+                heights.update_log[e, -1, 0] = np.where(
+                    can_fuse_velocity[e], nu[:, DOWN_COLUMN], np.nan
+                )
+                heights.update_log[e, -1, 1] = S[:, DOWN_COLUMN]
+            heights.update_bad_acceleration(e, event_time_s[e])
         if is_bias_constant is not None:
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before[is_bias_constant]
             P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
@@ -590,13 +590,11 @@ def _sequential_update(
     rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
-        column = columns[:, j]
-        cross_covariance = column[:, rows]
+        column = columns[:, j : j + 1]
+        cross_covariance = columns[:, j, rows]
         b[:, j] -= weight_squared[:, j] * cross_covariance[:, j]
-        if j < nu.shape[1] - 1:
-            columns[:, j + 1 :] -= (b[:, j, None] * cross_covariance[:, j + 1 :])[
-                :, :, None
-            ] * column[:, None]
+        factor = b[:, j, None] * cross_covariance[:, j + 1 :]
+        columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root

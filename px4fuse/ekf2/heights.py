@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import BadAcceleration
+from px4fuse.ekf2.bad_acceleration import MIN_LARGER_RATIO, BadAcceleration
 from px4fuse.ekf2.barometer import fused_samples
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
@@ -161,9 +161,9 @@ class HeightFilter:
 
     Attributes
     ----------
-    update_log : ndarray, shape (E, k + 1, 3, S)
-        For the k barometer samples and the GNSS height of each event: innovation (m, measurement
-        minus state), its variance (m²), and 1 if fused.
+    update_log : ndarray, shape (E, k + 2, 3, S)
+        For the k barometer samples, the GNSS height and the vertical GNSS velocity of each event:
+        innovation (measurement minus state), its variance, and 1 if fused.
     """
 
     def __init__(
@@ -184,7 +184,9 @@ class HeightFilter:
         self.fused = heights.fused
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
         self.time_s = [*measured_at_s, fix_s]
-        self.update_log = np.full((len(fix_s), len(self.time_s), 3, configuration_count), np.nan)
+        self.update_log = np.full(
+            (len(fix_s), len(self.time_s) + 1, 3, configuration_count), np.nan
+        )
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
         has_barometer = (is_sample > 0.0) & enabled[BAROMETER.name]
         self.has_sample = np.concatenate(
@@ -197,11 +199,19 @@ class HeightFilter:
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        self.learning = enabled[heights.reference]
         value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
         start_s = float(segment.time_s[0])
-        step_s = float(np.median(segment.step_s))
-        self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
+        self.bias = BiasEstimator(value_m, variance_m2, float(np.median(segment.step_s)))
+        self.updates_bias = self.has_sample & enabled[heights.reference]
+        biased_slots = slice(0, -1) if self.biased[0] else slice(-1, None)
+        self.interval_s = np.zeros(self.has_sample.shape)
+        # times of the samples in the order of fusion, event after event
+        sample_s = np.stack(np.broadcast_arrays(*self.time_s, self.has_sample[0])[:-1])
+        sample_s = np.where(self.has_sample, sample_s, start_s)[biased_slots].swapaxes(0, 1)
+        latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
+        interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
+        self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
+        self.interval_s *= self.updates_bias
 
     def updates(self, sensor: str, configuration: int, end_s: Array) -> pd.DataFrame:
         """Return the updates of one filter configuration with one sensor.
@@ -242,16 +252,19 @@ class HeightFilter:
         if self.any_sample[-1][e]:
             column = P[:, :, DOWN]
             nu = gnss_m - x[:, DOWN]
-            x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
+            slot = len(self.down_m)
+            x, P = self._fuse_innovation(e, slot, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
         return x, P
 
-    def ratios(self, e: int) -> Array:
-        """Return state minus measurement (down) in √S of one event, shape (k + 1, S).
-
-        The last row is GNSS height; NaN without a sample.
-        """
-        nu, S = self.update_log[e, :, 0], self.update_log[e, :, 1]
-        return np.where(self.has_sample[:, e], -nu / np.sqrt(S), np.nan)
+    def update_bad_acceleration(self, e: int, time_s: Array) -> None:
+        """Update the flag of a bad acceleration after all fusions of one event."""
+        update_log = self.update_log[max(e - 1, 0) : e + 1]
+        ratios = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
+        if (ratios > MIN_LARGER_RATIO).any():
+            has_sample = self.has_sample[:, max(e - 1, 0) : e + 1].swapaxes(0, 1)
+            ratios[:, :-1] = np.where(has_sample, ratios[:, :-1], np.nan)
+            ratios[:, -2] = np.fmax(ratios[:, -2], ratios[:, -1])
+            self.bad_acceleration.update(time_s, ratios[0, :-1], ratios[-1, :-1])
 
     def _fuse_innovation(
         self,
@@ -272,15 +285,14 @@ class HeightFilter:
                 nu,
                 predicted_variance,
                 R,
-                self.time_s[slot][e],
-                self.has_sample[slot][e],
-                self.learning[e],
+                self.interval_s[slot, e],
+                self.updates_bias[slot, e],
                 weight,
             )
         if sensor_index == 0 and self.in_ground_effect[slot, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = predicted_variance + R
-        has_sample = self.has_sample[slot][e]
+        has_sample = self.has_sample[slot, e]
         is_fused = has_sample & (nu * nu <= self.gate2[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
@@ -289,6 +301,7 @@ class HeightFilter:
             limit = np.sqrt(self.gate2[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -limit, limit), nu)
             is_fused |= is_clipped
-        self.update_log[e, slot] = nu, S, is_fused
+        update_log = self.update_log[e, slot]
+        update_log[0], update_log[1], update_log[2] = nu, S, is_fused
         K = column * (is_fused / (predicted_variance + R / weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

@@ -45,6 +45,7 @@ from px4fuse.flight.model import (
     FusionRecord,
     PositionTrack,
     Unavailable,
+    reset_times_s,
     step_values_at,
 )
 from px4fuse.flight.position_source import POSITION_FILE
@@ -108,6 +109,8 @@ class ReceivedPositions:
         Name of the position track.
     uses_sender_times : bool
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
+    reset_s : ndarray
+        Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
     correction_m : ndarray, shape (m, 2), or None
         EKF2's position correction by each sample (north and east), estimated from the published
         position. None if all rejections are logged, if none occurred, or with vision that is fused
@@ -124,6 +127,7 @@ class ReceivedPositions:
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
     uses_sender_times: bool = False
+    reset_s: Array | tuple[()] = ()
     correction_m: Array | None = None
 
     __repr__ = one_line_repr
@@ -547,7 +551,15 @@ def read_vision(
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = timestamp_s + np.interp(timestamp_s, age.index, age)
     decisions = _logged_decisions(ekf2, record, timestamp_s)
-    return ReceivedPositions(timestamp_s, arrival, position, variance, *decisions, track.name)
+    return ReceivedPositions(
+        timestamp_s,
+        arrival,
+        position,
+        variance,
+        *decisions,
+        track.name,
+        reset_s=reset_times_s(track),
+    )
 
 
 def _read_vision_besides_gnss(

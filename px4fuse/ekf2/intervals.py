@@ -139,6 +139,7 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end[1:] > end[:-1]
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
+    action[np.isin(stamp, received.reset_s) & (action == FUSE)] = START
     # in gaps of the position source there are additional events; their number does not depend on
     # the delay
     gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])

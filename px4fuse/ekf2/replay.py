@@ -77,6 +77,8 @@ MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # the gate limit changes many later samples: then only rejected fraction and mean NIS are compared,
 # and single innovations in a second replay with the logged rejections
 MANY_REJECTIONS_SHARE = 0.05
+# Minimum rejected fraction for blaming the resets in a log for a replay that does not agree with it
+MOSTLY_REJECTED_SHARE = 0.5
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
@@ -543,12 +545,13 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
     """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    columns = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
-    truth = flight.truth.samples.dropna(subset=columns)
-    if truth.empty:
+    samples = flight.truth.samples
+    component = signals.weighted_sum(samples, Columns.POSITION, direction)
+    is_known = np.isfinite(component)
+    if not is_known.any():
         return None
-    is_inside = (times >= truth.index[0]) & (times <= truth.index[-1])
-    error = (position - along(truth, Columns.POSITION, direction, times))[is_inside]
+    truth = np.interp(times, samples.index[is_known], component[is_known], np.nan, np.nan)
+    error = (position - truth)[np.isfinite(truth)]
     return rms(error) if len(error) else None
 
 
@@ -626,10 +629,17 @@ def with_logged_rejections(
     is_good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
     )
+    reason = f"with EKF2's logged rejections: {reason}"
+    if not is_good and agreement.rejected_fraction_logged > MOSTLY_REJECTED_SHARE:
+        reason = (
+            f"EKF2 rejected {agreement.rejected_fraction_logged:.0%} of the positions and used the "
+            "IMU, with a reset after each second. The log does not show which sample each reset "
+            "used. The frame of the source is probably wrong"
+        )
     return replace(
         logged_rejections_agreement if has_all_decisions else agreement,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,
-        reason=f"with EKF2's logged rejections: {reason}",
+        reason=reason,
     )

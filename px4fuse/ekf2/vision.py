@@ -121,7 +121,7 @@ class VisionFilter:
         )
         start_s = float(segment.time_s[0])
         bias = np.zeros((configuration_count, 2))
-        self.bias = BiasEstimator(bias, bias + np.inf, start_s, float(np.median(segment.step_s)))
+        self.bias = BiasEstimator(bias, bias + np.inf, float(np.median(segment.step_s)))
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
         self.fused_s = np.full(configuration_count, start_s)
         self.was_without_gnss = self.without_gnss[0]
@@ -168,8 +168,11 @@ class VisionFilter:
         distance_m = (
             self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
         )
-        sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
-        nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
+        updates_bias = has_sample & ~without_gnss
+        interval_s = np.where(updates_bias, now_s - self.last_sample_s, 0.0)
+        nu, R = self.bias.remove_bias(
+            distance_m, diagonal.copy(), noise_m2, interval_s[:, None], updates_bias[:, None]
+        )
         diagonal += R
         has_restarted = (now_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
             without_gnss != self.was_without_gnss

@@ -540,8 +540,8 @@ def _innovation_statistics(
     updates: pd.DataFrame, *axes: AxisName
 ) -> tuple[float, tuple[float, float], float]:
     """Return mean NIS, its 95 % band and the standard deviation of the innovations of all axes."""
-    nu = updates[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
-    S = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
+    nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
+    S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])
     return float(np.mean(nu**2 / S)), nis_band(len(nu)), float(np.std(nu))
 
 

@@ -6,12 +6,13 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
 from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
+from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10
@@ -26,6 +27,7 @@ def detect(analysis: Analysis) -> Findings:
     if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
         yield from detect_wrong_delay(analysis, clock)
+    yield from detect_wrong_gnss_delay(analysis)
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
@@ -139,6 +141,29 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
         f"{f' EKF2_EV_DELAY cannot {limit}.' if limit else ''}",
         CORRECT_AT_SENDER if limit else _delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
+    )
+
+
+def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
+    """Detect an EKF2_GPS_DELAY that differs from the delay of GNSS, with vision as reference."""
+    model = analysis.ekf2_model
+    if isinstance(model, Unavailable) or not model.agreement.good:
+        return
+    estimate = remedy.estimate_gnss_delay_ms(model)
+    if estimate is None:
+        return
+    delay_ms, (ml_delay_ms, sigma_ms) = model.inputs.settings[GNSS_POS.delay], estimate
+    limit_ms = max(1e3 * MIN_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
+    if abs(ml_delay_ms - delay_ms) <= limit_ms or ml_delay_ms < 0.0:
+        return
+    yield warning(
+        "ekf2_gps_delay_wrong",
+        f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
+        f"{ml_delay_ms:.0f} ms late. The σ of the estimate is {sigma_ms:.0f} ms; it is from "
+        "re-runs of EKF2, which also fuses vision. EKF2 fuses each GNSS sample at the wrong time, "
+        "so its track leads or lags.",
+        f"Set {remedy.format_settings({GNSS_POS.delay: round(ml_delay_ms)})}.",
+        {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": ml_delay_ms, "sigma_ms": sigma_ms},
     )
 
 
