@@ -13,8 +13,8 @@ from explore_tools import axe, serious
 from msgspec import structs
 
 import px4fuse
-from px4fuse.card.model import Action, Card, Identity, Note
-from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.card.model import Action, Card, Identity, Note, axis_fraction
+from px4fuse.core.text import format_ratio
 from px4fuse.report.card_html import (
     MARK_PATHS,
     alternative_text,

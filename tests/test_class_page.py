@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 import json
@@ -16,7 +15,6 @@ from browser import Browser, Elements, content
 from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
-from pypdf import PdfReader
 
 from px4fuse.classroom.grading.class_page import count_tenths, html_text
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
@@ -155,7 +153,7 @@ def test_class_page_average_excludes_pending_points() -> None:
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
-                         ["13 / 20", 13.0, "set by instructor", "", 0.65]]  # fmt: skip
+                         ["13 / 20", 13.0, "set by instructor"]]  # fmt: skip
 
 
 def test_class_page_shortens_long_text_and_omits_nan() -> None:
@@ -260,10 +258,6 @@ def test_class_page_filters_reports_by_text_and_status(page: Browser) -> None:
 
 
 def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
-    assert page.ask("[...document.querySelectorAll('.bar')].every((one) => one.ariaHidden)")
-    assert page.ask("document.querySelector('tr:first-child .bar').closest('td').innerText") == (
-        "18.5 / 20"
-    )
     page.click("tbody tr:first-child .name")
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
@@ -340,21 +334,6 @@ def test_class_page_content_policy_blocks_images_and_requests(page: Browser) -> 
     refusals = [c["entry"]["text"] for c in page.complaints() if "entry" in c]
     assert len([text for text in refusals if "Content Security Policy" in text]) >= 2
     assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
-
-
-def test_class_page_print_repeats_table_header(browser: Browser, tmp_path: Path) -> None:
-    file = tmp_path / "class.html"
-    many = [row(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(130)]
-    file.write_bytes(html_text(many, "Class", "px4fuse 1").encode())
-    browser.open(file)
-    printed = browser.call("Page.printToPDF", preferCSSPageSize=True)["data"]
-    pages = [page.extract_text() for page in PdfReader(io.BytesIO(base64.b64decode(printed))).pages]
-    listed = [text for text in pages if "Look here." in text]
-    assert len(listed) > 1
-    assert all("Points" in text for text in listed)
-    assert not any("Find" in text for text in pages)
-    # rows outside the screen are printed, too
-    assert "Student 129" in "".join(pages)
 
 
 def test_class_page_downloads_points_and_comments_as_csv(page: Browser) -> None:

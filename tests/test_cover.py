@@ -6,13 +6,11 @@ import re
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from cards import SMALL_SIGMA_A, verdicts
 from comparisons import compare
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from msgspec.structs import replace
 from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
@@ -24,8 +22,6 @@ from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-
-LIMITS = ((0.0, 10.0), (0.0, 4.0))
 
 
 def page_of(card: Card) -> Page:
@@ -145,7 +141,7 @@ def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     text = text_of(card)
     assert "barometer height 0.57" in text
     assert "magnetometer x not evaluated" in text
-    assert "that is usual and not a fault" in text
+    assert "this is usual and not a fault" in text
 
 
 def test_report_cover_right_to_left_name_precedes_the_id() -> None:
@@ -196,48 +192,28 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_track_outside_map_has_arrow_and_distance_from_map() -> None:
-    x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
-    y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
-    found = list(cover_panels._map_exits((x, y), LIMITS))
-    assert [marker for marker, _ in found] == [">", "v"]
-    assert [place for _, place in found] == [(10.0, 1.0), (5.0, 0.0)]
-    inside = np.full(7, 2.0)
-    text = cover_panels._leaving_tracks({"KF": (x, y), "EKF2": (inside, inside)}, LIMITS)
-    assert text == "KF 3.00 m"
+def test_cover_map_title_states_distance_of_track_outside() -> None:
+    flight = aisle_flight(duration_s=60.0)
+    flight.ekf2.state.loc[30.0:31.0, "east_m"] += 40.0
+    analysis = unexplained(compare(flight))
+    titles = panels_by_title(drawn(analysis))
+    (title,) = (title for title in titles if title.startswith("Map"))
+    assert title.startswith("Map; tracks leave it by up to: EKF2 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
-    strip = cover_panels._innovation_strip(eventful.main)
+    plot = cover_panels._innovation_plot(eventful.main)
     updates = eventful.main.replay.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_NORMALISED
-    assert f"beyond ±4, up to KF {largest:.0f}" in strip.title
-    axes = panels_by_title(drawn(eventful))[strip.title]
-    edges = [line for line in axes.lines if line.get_marker() in "^v" and len(line.get_xdata())]
+    assert f"beyond ±4, up to KF {largest:.0f}" in plot.title
+    axes = panels_by_title(drawn(eventful))[plot.title]
+    edges = [
+        line for line in axes.lines if line.get_marker() in ("^", "v") and len(line.get_xdata())
+    ]
     assert edges
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
-
-
-def test_error_plot_title_states_that_a_small_curve_looks_flat(eventful: Analysis) -> None:
-    error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
-    label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
-    titles = [
-        cover_panels._error_strip(eventful, label, ["RMSE 0.040"], error, sigmas, scale).title
-        for scale in (0.1, 5.0)
-    ]
-    assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
-    assert titles[1] == f"{titles[0]}, at most 0.050, flat on this scale"
-
-
-def test_sigma_beyond_plot_scale_is_annotated_with_its_value() -> None:
-    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
-    axes.set(xlim=(0.0, 9.0), ylim=(-1.0, 1.0))
-    cover_panels._draw_sigma(axes, pd.Series([0.1, 2.0, 0.1], [0.0, 4.0, 9.0]), "KF")
-    marks = {line.get_marker(): (line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines}
-    assert marks == {"^": (4.0, 1.0), "v": (4.0, -1.0)}
-    assert [text.get_text() for text in axes.texts] == ["±2σ of KF up to ±4.00 m"]
 
 
 def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> None:

@@ -22,10 +22,10 @@ from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.numbers import format_ratio
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
 from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.core.text import format_ratio
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text

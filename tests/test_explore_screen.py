@@ -14,8 +14,9 @@ from comparisons import compare_prepared
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.card.model import axis_fraction
 from px4fuse.card.verdicts import verdicts
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
 from px4fuse.report.card_html import card_of

@@ -11,7 +11,6 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
-from px4fuse.cli.tune import format_noise_estimate
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -27,7 +26,7 @@ from px4fuse.filter.tuning import (
     tune_axes,
 )
 from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.report.sensitivity import format_noise
+from px4fuse.report.phrases import format_noise_estimate
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
@@ -226,20 +225,6 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
 
 
 # --- real and simulated logs ---
-
-
-@pytest.mark.parametrize(
-    ("noise", "said"),
-    [
-        (Noise(0.1, 0.05, 0.2), "0.1 m (0.05 to 0.2)"),
-        (Noise(0.1, None, None), "0.1 m or more"),
-        (Noise(None, None, 0.05), "at most 0.05 m"),
-        (Noise(None, 8.0, None), "at least 8 m"),
-        (Noise(None, None, None), "unknown"),
-    ],
-)
-def test_format_noise_without_interval_states_bound(noise: Noise, said: str) -> None:
-    assert format_noise(noise, "m") == said
 
 
 @pytest.mark.parametrize(

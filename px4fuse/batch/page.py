@@ -10,14 +10,13 @@ import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
 from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
-from px4fuse.card.numbers import format_metres, format_ratio
-from px4fuse.core.text import format_number, join_first
+from px4fuse.core.text import format_metres, format_number, format_ratio, join_first
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import clean, load_template, local_link
-from px4fuse.report.card_html import MARK_PATHS, SEVERITY_SIGNS, band_limits
-from px4fuse.report.card_text import FILTER_NAMES, MARKS
+from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
 # verdicts of the diagnosis (Card)
@@ -96,7 +95,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{FILTER_NAMES[filter_name]} {MARKS[reference_name]}",
+                    f"{filter_name.upper()} {MARKS[reference_name]}",
                     "ratio",
                     visible_from="tablet",
                 )

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_of, sort_logs
 from px4fuse.batch.rows import FAILED
-from px4fuse.card.numbers import format_ratio
-from px4fuse.core.text import format_number
-from px4fuse.report.card_html import SEVERITY_SIGNS
+from px4fuse.core.text import format_number, format_ratio
+from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval

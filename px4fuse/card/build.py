@@ -13,7 +13,6 @@ from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.causes import (
-    FILTER_NAMES,
     RankedCause,
     can_show_effect,
     make_cause,
@@ -21,6 +20,7 @@ from px4fuse.card.causes import (
     rank_causes,
 )
 from px4fuse.card.model import (
+    FILTER_NAMES,
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,
@@ -34,16 +34,14 @@ from px4fuse.card.model import (
     Note,
     Verdict,
 )
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
-from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, file_size, read_head
-from px4fuse.core.text import lower_first, with_log_name
+from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log_name
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
@@ -58,7 +56,7 @@ from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 that the effect on the card states
+# Minimum fraction of positions rejected by EKF2 for a sentence on the card
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
 # Aiding sources whose √S is usually too large with PX4's default noises, which is no fault
@@ -67,15 +65,15 @@ DRIFT_HIDES_ERROR = (
     "σ too large against the source is not a fault here: the source may drift, and innovations do "
     "not show drift. Do not lower the noises for it."
 )
-# Number of first bytes that the card of an unreadable log shows, and those of each ULog
-SHOWN_BYTE_COUNT, ULOG_HEAD = 4, "55 4C 6F 67"
+SHOWN_BYTE_COUNT = 4  # number of bytes of an unreadable log that its card shows
+ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog
 HEADING_HIDES_ERROR = (
     "Both filters rotate the measured acceleration by the wrong heading and return to the position "
-    "at each update, so the innovations show only a part of the error."
+    "at each update, so the innovations show little of the error."
 )
 UNEXPLAINED_DIFFERENCE = "The two verdicts differ, and no tested change explains it."
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
-# Findings about the source with the sentence on verdicts that differ
+# Explanation of differing verdicts, by the ids of findings about the position source
 SENTENCES_BY_SOURCE_FAULT = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
@@ -107,10 +105,10 @@ def build_card(
     student : (str, str)
         Name and id of the student.
     """
-    result, source, segment = analysis.main, analysis.source, analysis.segment
-    roots = [group[0] for group in group_by_root(analysis.findings)]
-    verdicts = make_verdicts(result)
-    ranked_causes = rank_causes(analysis, roots)
+    source, segment = analysis.source, analysis.segment
+    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    verdicts = make_verdicts(analysis.main)
+    ranked_causes = rank_causes(analysis, root_findings)
     causes = tuple(
         make_cause(analysis, ranked_finding, verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
@@ -120,9 +118,7 @@ def build_card(
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(
-        analysis, verdicts, causes, [finding.id for finding in analysis.findings]
-    )
+    reconcile = _reconcile(analysis, verdicts, causes)
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
@@ -130,9 +126,9 @@ def build_card(
     elif reconcile == UNEXPLAINED_DIFFERENCE:
         verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
     effect = _make_effect(analysis)
-    severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
+    severity: CardSeverity = "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
     return Card(
-        severity=severity,
+        severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
         headline=_headline(causes, verdicts),
         effect=effect,
@@ -143,7 +139,7 @@ def build_card(
         difference=_difference_text(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
-        notes=_make_notes(roots, request.log),
+        notes=_make_notes(root_findings, request.log),
         identity=_identity(
             analysis.flight.log,
             request,
@@ -160,9 +156,9 @@ def build_card(
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Build the card of a flight without a position source, from EKF2's aiding sources."""
-    roots = [group[0] for group in group_by_root(analysis.findings)]
-    faults = [finding for finding in roots if finding.severity != "note"]
+    """Build the card of a flight without a position source."""
+    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
     missing_data = analysis.missing_data
     return Card(
@@ -172,7 +168,7 @@ def build_aids_card(
         do_this=_action_sentences(causes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES, 0),
-        notes=_make_notes(roots, request.log),
+        notes=_make_notes(root_findings, request.log),
         aids=tuple(
             AidRow(
                 label=aid.label,
@@ -191,7 +187,7 @@ def build_aids_card(
 def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
     facts = {}
-    with suppress(LogError):  # without access to the file, the error states the reason
+    with suppress(LogError):  # the headline states the reason if the file cannot be read
         head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
         size = file_size(path, LogError)
         facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
@@ -204,10 +200,6 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
         facts=facts,
         identity=Identity(file=display_name(path)),
     )
-
-
-def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
-    return "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
 
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
@@ -238,8 +230,11 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 
 def _make_effect(analysis: Analysis) -> Effect:
-    result, has_ekf2 = analysis.main, isinstance(analysis.flight.ekf2, Ekf2)
-    difference = result.difference
+    result, difference = analysis.main, analysis.main.difference
+    reset_count, flight = None, analysis.segment.flight
+    if isinstance(analysis.flight.ekf2, Ekf2):
+        resets_s = horizontal_resets_s(analysis.flight.ekf2)
+        reset_count = int(((flight.start_s < resets_s) & (resets_s <= flight.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, result),
         position_rmse_m={
@@ -250,15 +245,8 @@ def _make_effect(analysis: Analysis) -> Effect:
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
-        horizontal_resets=len(horizontal_resets(analysis)) if has_ekf2 else None,
+        horizontal_resets=reset_count,
     )
-
-
-def horizontal_resets(analysis: Analysis) -> Array:
-    """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
-    times = horizontal_resets_s(ekf2) if isinstance(ekf2, Ekf2) else np.empty(0)
-    return times[(segment.start_s < times) & (times <= segment.end_s)]
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
@@ -335,7 +323,7 @@ def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most three actions, with the number of the cause if there are several causes."""
+    """Return at most three recommended actions."""
     texts: list[str] = []
     for number, cause in enumerate(causes, 1):
         sentences = [_action_sentence(action) for action in cause.actions if _is_change(action)]
@@ -353,9 +341,10 @@ def _is_change(action: Action) -> bool:
 
 def _action_sentence(action: Action) -> str:
     if action.where == "console":
-        one_change = action.sentence.partition(" ")[2]  # the command states the parameter
-        change = one_change if len(action.commands) == 1 else action.sentence
-        return f"EKF2: {', '.join(action.commands)} ({change})."
+        # the command already contains the name of the parameter
+        value_change = action.sentence.partition(" ")[2]
+        change_text = value_change if len(action.commands) == 1 else action.sentence
+        return f"EKF2: {', '.join(action.commands)} ({change_text})."
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options}."
@@ -366,7 +355,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark the inconsistent verdicts of filters that need no change.
+    """Mark inconsistent verdicts of filters that need no change.
 
     If the source may drift, a σ that is too large against the source is not a fault.
     """
@@ -396,10 +385,9 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return EKF2's error ÷ σ at the fusion horizon, or None unless it is consistent only there.
+    """Return EKF2's error ÷ σ at the fusion horizon if it is consistent only there, else None.
 
     The published position includes the lag of EKF2's output predictor, which σ does not describe.
-    None if the published position is consistent, or if the horizon is not logged or not consistent.
     """
     result, ekf2 = analysis.main, analysis.flight.ekf2
     published_verdict = make_verdicts(result)[-1]
@@ -408,9 +396,9 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     horizon = project_horizon(ekf2, result.axis, analysis.segment)
     if horizon is None or not isinstance(result.truth, pd.DataFrame):
         return None
-    truth = result.truth["position_m"]
-    error = horizon["position_m"] - np.interp(horizon.index, truth.index, truth, np.nan, np.nan)
-    nees = float(np.nanmean(np.square(error) / horizon["position_variance_m2"]))
+    true_m = result.truth["position_m"]
+    error_m = horizon["position_m"] - np.interp(horizon.index, true_m.index, true_m, np.nan, np.nan)
+    nees = float(np.nanmean(np.square(error_m) / horizon["position_variance_m2"]))
     ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
     return ratio if classify_ratio(ratio, "truth") == "consistent" else None
 
@@ -422,9 +410,7 @@ def _horizon_sentence(ratio: float) -> str:
     )
 
 
-def _reconcile(
-    analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
-) -> str:
+def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> str:
     """Explain why verdicts against source and ground truth differ; "" if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
@@ -442,8 +428,9 @@ def _reconcile(
     ]
     if not differing:
         return ""
+    finding_ids = {finding.id for finding in analysis.findings}
     for ids_of_source, sentence in SENTENCES_BY_SOURCE_FAULT:
-        if not ids_of_source.isdisjoint(ids):
+        if not finding_ids.isdisjoint(ids_of_source):
             return sentence
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
@@ -459,18 +446,18 @@ def _reconcile(
         ):
             noise = f" of {format_metres(sigma)} m"
         return (
-            f"Source: the noise{noise} from sample to sample is less than both filters assume. "
-            "Ground truth: the source as a whole drifts, which no innovation can show."
+            f"The noise of the source{noise} is less than both filters assume. The drift of the "
+            "source does not appear in the innovations, so only ground truth shows it."
         )
-    if "source_noise_time_correlated" in ids:
+    if "source_noise_time_correlated" in finding_ids:
         return (
             "Innovations show only the error that changes from sample to sample. Both filters "
-            "follow the slow part, so it shows against ground truth alone."
+            "follow the slow error, so only ground truth shows it."
         )
     unexplained_text = (
-        HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED_DIFFERENCE
+        HEADING_HIDES_ERROR if "ekf2_heading_error" in finding_ids else UNEXPLAINED_DIFFERENCE
     )
-    is_gated = "source_outliers" in ids and "ekf2" in differing
+    is_gated = "source_outliers" in finding_ids and "ekf2" in differing
     return _gate_sentence(analysis) if is_gated else unexplained_text
 
 
@@ -482,7 +469,7 @@ def _verdicts_differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> 
 
 
 def _gate_sentence(analysis: Analysis) -> str:
-    """State how many positions EKF2's gate rejected, and innovation ÷ √S of the accepted ones."""
+    """Explain that EKF2's gate rejected positions, so its state is better than its innovations."""
     innovations = analysis.main.ekf2_innovations
     assert not isinstance(innovations, Unavailable)  # else EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]
@@ -491,9 +478,9 @@ def _gate_sentence(analysis: Analysis) -> str:
     )
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
-        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions. They count among "
-        f"the innovations, but did not move its state. Over the accepted positions its innovation "
-        f"÷ √S is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, so they did not "
+        "change its state, although their innovations are evaluated. Over the accepted positions, "
+        f"EKF2's innovation ÷ √S is {format_ratio(ratio)}."
     )
 
 
@@ -508,7 +495,9 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
         if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
     }
     if len(filter_names) == 2:
-        return f"{text}. Both filters have the fault, so this difference does not show it."
+        return (
+            f"{text}. The fault affects both filters equally, so this difference does not show it."
+        )
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
     filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
     difference_after_m = after.get(filter_name)
@@ -519,10 +508,10 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     return f"{text}; {difference_text} {FILTER_NAMES[filter_name]} corrected."
 
 
-def _make_notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
+def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
     return tuple(
-        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log))
-        for finding in roots
+        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log_name))
+        for finding in root_findings
         if finding.severity == "note"
     )
 

@@ -6,12 +6,12 @@ RMSE, or if no re-run can show its effect. A change of a filter is proposed only
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
@@ -36,7 +36,7 @@ from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
-# Kinds of change (:attr:`Trial.kinds`) whose re-runs test a finding, by the id of the finding
+# Kinds of changes whose re-runs test a finding (:attr:`Trial.kinds`), by id of the finding
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "source_time_offset": frozenset({"time offset", "delay"}),
     "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
@@ -56,7 +56,7 @@ RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "ekf2_overconfident": frozenset({"process noise"}),
     "ekf2_underconfident": frozenset({"process noise"}),
 }
-# Findings that make the verdicts meaningless; they are the first causes on the card
+# Ids of findings that make the verdicts meaningless, so they are the first causes on the card
 MEANINGLESS_VERDICT_FINDINGS = (
     "log_damaged",
     "not_px4",
@@ -64,7 +64,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "imu_samples_missing",
     "ekf2_not_fusing",
 )
-# Findings that only state a verdict on σ; they are causes on the card if there is no other cause
+# Ids of findings that only repeat a verdict on σ; the card lists them without any other cause only
 VERDICT_FINDINGS = frozenset(
     {
         "error_exceeds_reported_sigma",
@@ -75,11 +75,11 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of change that shift both filters with the source, which only ground truth shows
+# Kinds of changes that move both filters with the position source, which only ground truth shows
 UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of names of parameters that PX4 reads at boot only (reboot_required in its metadata)
+# Endings of the names of parameters that PX4 reads only at boot (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of positions rejected by EKF2 for a column of the re-run table
+# Minimum fraction of positions rejected by EKF2 for a column in the table of re-runs
 MIN_SHOWN_REJECTION = 0.005
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
@@ -90,13 +90,12 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices or persons that act against a finding, if they differ from those of its group
+# Target of the action against a finding, by id, if it differs from the target of its group
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
-FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class RankedCause(NamedTuple):
-    """Finding with the re-runs that test it; the card lists causes by tier, 0 first."""
+    """Finding with the re-runs that test it; the card lists causes in ascending tier."""
 
     finding: Finding
     tier: int
@@ -104,20 +103,23 @@ class RankedCause(NamedTuple):
     trials: tuple[Trial, ...]
 
 
-def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
-    """Return the causes of a flight in the order of the report's summary.
+def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
+    """Return the causes of a flight in the order of the card.
 
-    First come findings that make the verdicts meaningless, then those whose re-run makes a filter
-    consistent, then those whose re-run halves |ln(actual ÷ reported σ)|, then other errors and
-    warnings. A fault of the source precedes a setting that would only hide it, or that leaves the
-    error against ground truth as it is.
+    1. Findings that make the verdicts meaningless.
+    2. Findings whose re-run makes a filter consistent.
+    3. Findings whose re-run halves the logarithm of a σ ratio.
+    4. Other errors, and settings that leave the error against ground truth unchanged.
+    5. Other warnings.
+
+    Within a tier, faults of the position source precede settings that would only hide them.
     """
     ranked_causes = []
-    for finding in roots:
+    for finding in root_findings:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.main_trials, finding)
-        if finding.id in VERDICT_FINDINGS:  # a verdict remains a cause without a re-run that helps
+        if finding.id in VERDICT_FINDINGS:  # a verdict is a cause even if no re-run improves it
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
@@ -126,16 +128,13 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         ranked_causes.append(
             RankedCause(finding, _cause_rank(finding, trials), sum(map(reduction, trials)), trials)
         )
-    has_cause = any(trial.finding.id not in VERDICT_FINDINGS for trial in ranked_causes)
-    ranked_causes = [
-        trial for trial in ranked_causes if not (has_cause and trial.finding.id in VERDICT_FINDINGS)
-    ]
+    faults = [cause for cause in ranked_causes if cause.finding.id not in VERDICT_FINDINGS]
     return sorted(
-        ranked_causes,
-        key=lambda trial: (
-            trial.tier,
-            trial.tier in (1, 2, 3) and _is_setting(trial.finding),
-            -trial.reduction,
+        faults or ranked_causes,
+        key=lambda cause: (
+            cause.tier,
+            cause.tier in (1, 2, 3) and _is_setting(cause.finding),
+            -cause.reduction,
         ),
     )
 
@@ -174,13 +173,13 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth, which is missing, could show the effect of a re-run."""
+    """Return False if the effect of a re-run is visible only in ground truth and there is none."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def is_useful(trial: Trial) -> bool:
-    """Return True unless a re-run shows that its change improves nothing."""
+    """Return True if a re-run is better than the flight, or if no ground truth can show it."""
     return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
@@ -190,7 +189,7 @@ def make_cause(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
+    """Make the cause of a finding, with actions for the sender, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
@@ -204,19 +203,15 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make the numbered cause of a finding that no re-run tests."""
+    """Make the cause of a finding without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,
-        why=_cause_reason(finding),
+        why=finding.message.removeprefix(finding.title).lstrip(". "),
         spans_s=finding.spans_s,
         actions=(Action(_target_of(finding), finding.remedy),) if finding.remedy else (),
     )
-
-
-def _cause_reason(finding: Finding) -> str:
-    return finding.message.removeprefix(finding.title).lstrip(". ")
 
 
 def _make_actions(
@@ -226,14 +221,9 @@ def _make_actions(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return the alternatives, of which one action is enough, and the other actions."""
-    finding, by_kind = (
-        ranked_cause.finding,
-        {
-            (useful_trial.filter, useful_trial.kinds[0]): useful_trial
-            for useful_trial in useful_trials
-        },
-    )
+    """Return the alternatives, of which one is enough, and the other actions."""
+    finding = ranked_cause.finding
+    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
     general_action = None
@@ -272,7 +262,7 @@ def _make_actions(
             and trial.change.keys() <= PARAMETERS.keys()
         ):
             actions.append(set_parameters(analysis, trial.change))
-    # actions on KF last: correct the vehicle before this log is analysed again
+    # actions on KF are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
     reasons = {
@@ -305,7 +295,7 @@ def _no_change_reason(
         if filter_name == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
-            return "no change: its gate rejects outliers, and σ covers the error"
+            return "no change: the gate rejects outliers, and the reported σ is consistent"
     return (
         f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
     )
@@ -320,7 +310,7 @@ def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
 def run_again(
     request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
 ) -> Action:
-    """Return the command that runs KF with changed settings; ``defaults`` would be as good."""
+    """Return the action to run KF with changed settings."""
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
@@ -330,7 +320,7 @@ def run_again(
 
 
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
-    """Return the console lines that set parameters of EKF2, with old and new values."""
+    """Return the action to set EKF2 parameters in the MAVLink console."""
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     texts, commands, needs_reboot = [], [], False
@@ -351,24 +341,23 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
 
 
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
-    rejected_fractions = _change_pair(trial.before.rejected_fraction, trial.after.rejected_fraction)
+    before, after = trial.before, trial.after
+    ratios_before, ratios_after = ratios(before), ratios(after)
+    pairs: dict[str, Any] = {
+        "position_rmse_m": (before.position_rmse_m, after.position_rmse_m),
+        "source_ratio": (ratios_before.get("source"), ratios_after.get("source")),
+        "truth_ratio": (ratios_before.get("truth"), ratios_after.get("truth")),
+    }
+    rejected_fractions = before.rejected_fraction or 0.0, after.rejected_fraction or 0.0
+    if max(rejected_fractions) >= MIN_SHOWN_REJECTION:
+        pairs["rejected_fraction"] = before.rejected_fraction, after.rejected_fraction
     return Rerun(
         label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
-        position_rmse_m=_change_pair(trial.before.position_rmse_m, trial.after.position_rmse_m),
-        source_ratio=_change_pair(ratios_before.get("source"), ratios_after.get("source")),
-        truth_ratio=_change_pair(ratios_before.get("truth"), ratios_after.get("truth")),
-        rejected_fraction=rejected_fractions
-        if rejected_fractions and max(rejected_fractions) >= MIN_SHOWN_REJECTION
-        else None,
         improves=improvement(trial),
+        **{name: pair for name, pair in pairs.items() if None not in pair},
     )
-
-
-def _change_pair(before: float | None, after: float | None) -> tuple[float, float] | None:
-    return None if before is None or after is None else (before, after)
 
 
 def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
@@ -393,7 +382,7 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _closing_sentence(
     analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
-    """Return the sentence below the re-runs: one action is enough, or the default is as good."""
+    """Return the sentence below the table of re-runs."""
     if alternatives:
         return (
             "Not both: the offset would be corrected twice. One offset, two signs: --clock-offset "
@@ -401,19 +390,15 @@ def _closing_sentence(
             "position (ms)."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return "Both values are consistent; the default needs no option."
+        return "KF is consistent with both values. The default needs no option."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
-        name = next(iter(trial.change))
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
             continue
-        default = analysis.flight.log.default_of(name)
-        if (
-            (horizontal_tuning.sigma_z.low or 0.0)
-            <= default
-            <= (horizontal_tuning.sigma_z.high or 0.0)
-        ):
-            return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
+        default = analysis.flight.log.default_of(next(iter(trial.change)))
+        sigma_z = horizontal_tuning.sigma_z
+        if (sigma_z.low or 0.0) <= default <= (sigma_z.high or 0.0):
+            return f"PX4's default of {default:g} m is within the 95 % interval, so it is as good."
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]

@@ -1,5 +1,6 @@
 """Summary of a report (headline, verdicts, causes, actions); part of the JSON results."""
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
@@ -13,18 +14,29 @@ FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
+FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 # Limits of the σ ratio of a consistent filter: against the source, and against ground truth
 SIGMA_RATIO_BANDS = CONSISTENT_RATIOS
-# Ends of the logarithmic axis of σ ratios; a ratio beyond is drawn as a triangle at the end
+# Ends of the logarithmic axis of σ ratios; ratios beyond are drawn as triangles
 AXIS_ENDS = (0.1, 10.0)
 # Ticks of the logarithmic axis of σ ratios, with their labels
 AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Maximum number of causes that a card lists; further ones are counted
+# Maximum number of causes on a card; more causes are counted
 MAX_CAUSES = 3
-# Maximum number of notes that cover and terminal print; further ones are counted
+# Maximum number of notes on the cover and the terminal; more notes are counted
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
+
+
+def axis_fraction(ratio: float) -> float:
+    """Return the position of a σ ratio on the logarithmic axis (0 to 1).
+
+    >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
+    (0.0, 0.5, 1.0)
+    """
+    low, high = (math.log10(end) for end in AXIS_ENDS)
+    return (math.log10(ratio) - low) / (high - low)
 
 
 class Verdict(Record, frozen=True, kw_only=True):
@@ -65,7 +77,7 @@ class Verdict(Record, frozen=True, kw_only=True):
 
 
 class Effect(Record, frozen=True, kw_only=True):
-    """Position errors of both filters, their difference, rejections and resets.
+    """Position errors of KF and EKF2, their difference, and EKF2's rejections and resets.
 
     Attributes
     ----------
@@ -111,7 +123,7 @@ class Action(Record, frozen=True):
 
 
 class Rerun(Record, frozen=True, kw_only=True):
-    """Numbers of a filter as flown, and run again with one change.
+    """Statistics of KF or EKF2 as flown, and run again with one change.
 
     Attributes
     ----------
@@ -136,7 +148,7 @@ class Rerun(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """Numbered cause of the card: fault with its size, effect, actions and re-runs.
+    """Cause on the card: fault with its magnitude, effect, actions and re-runs.
 
     Attributes
     ----------
@@ -213,7 +225,7 @@ class Identity(Record, frozen=True, kw_only=True):
 
 
 class AidRow(Record, frozen=True, kw_only=True):
-    """Ratio innovation ÷ √S of one component of an aiding source, without a position source."""
+    """Ratio of innovation to √S along one axis of an aiding source."""
 
     label: str
     component: str

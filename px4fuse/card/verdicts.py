@@ -17,10 +17,10 @@ from px4fuse.filter.consistency import (
 )
 from px4fuse.flight.model import Unavailable
 
-# Length (s) of the blocks of the bootstrap: position errors are correlated over seconds
+# Length (s) of the bootstrap blocks: longer than the correlation time of position errors
 BOOTSTRAP_BLOCK_S = 10.0
 BOOTSTRAP_RESAMPLES = 2000
-# Minimum number of blocks for an interval of the RMS; with fewer it is far too narrow
+# Minimum number of blocks: with fewer blocks the interval is far too narrow
 MIN_BOOTSTRAP_BLOCKS = 4
 
 
@@ -78,7 +78,7 @@ def _not_evaluated(
 
 
 def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | None:
-    """Return the 95 % interval of an RMS by the moving-block bootstrap, or None if too short.
+    """Return the 95 % interval of an RMS by block bootstrap; None for a short time series.
 
     Künsch (1989), Annals of Statistics 17(3). The seed is fixed, so that the result is repeatable.
 

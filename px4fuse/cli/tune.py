@@ -13,7 +13,7 @@ from px4fuse.core.record import Unavailable
 
 if TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison
-    from px4fuse.filter.tuning import AxisTuning, Noise
+    from px4fuse.filter.tuning import AxisTuning
     from px4fuse.report.page import Page
 
 TUNING_HEAD = (
@@ -64,20 +64,9 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     write_and_print(result_files(results, json_path), _page(comparison, tunings), request)
 
 
-def format_noise_estimate(noise: Noise) -> str:
-    """Format a maximum-likelihood noise and its 95 % interval, without the unit."""
-    if noise.value is None:
-        bounds = (("at most", noise.high), ("at least", noise.low))
-        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
-        return next(texts, "not identifiable")
-    low = "0" if noise.low is None else f"{noise.low:.2g}"
-    high = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({low}-{high})"
-
-
 def _page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.report.page import Page
-    from px4fuse.report.phrases import format_settings, tuning_advice
+    from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
     from px4fuse.report.style import MUTED_COLOUR
 
     page, rows, sentences = Page(), [], list[str]()

@@ -148,33 +148,8 @@ def innovations(
     For the parameters see :func:`run_filter`. Both results have the shape (m, ...) for a grid of
     shape (...). With k columns of input and one pair of settings, the shapes are (m, k) and (m,).
     """
-    steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped)
-    nu, s = zip(*(step[:2] for step in steps), strict=True)
+    nu, s = zip(*run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped), strict=True)
     return np.array(nu), np.array(s)
-
-
-@dataclass(frozen=True)
-class FilterStates:
-    """State and statistics of KF after each measurement; shape (m, ...) for a grid of settings."""
-
-    gain: Array
-    velocity_m_s: Array
-    sigma_p_m: Array
-    nis: Array
-
-
-def filter_states(
-    intervals: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike
-) -> FilterStates:
-    """Compute gain, velocity, reported σ and NIS of KF for every combination of settings.
-
-    ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other to a grid.
-    """
-    rows = [
-        (k0, v, np.sqrt(p00), nu**2 / s)
-        for nu, s, k0, _, v, (p00, _, _) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
-    ]
-    return FilterStates(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def run_filter(
@@ -183,7 +158,7 @@ def run_filter(
     sigma_z_m: ArrayLike,
     is_skipped: BoolArray | None,
     weight: Array | None = None,
-) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
+) -> Iterator[ArrayPair]:
     """Run KF over a grid of settings, measurement by measurement.
 
     With one pair of settings, Δp, Δv and measurements may have k columns, shape (m, k): KF is
@@ -201,9 +176,8 @@ def run_filter(
 
     Yields
     ------
-    tuple
-        ν (m), S (m²), gain, and after the update position (m), velocity (m/s) and covariance
-        elements 00, 01, 11. Each has the grid's shape, or is a float for a single setting.
+    (ndarray, ndarray) or (float, float)
+        ν (m) and S (m²). Both have the grid's shape, or are floats for a single setting.
     """
     squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
     q, r = np.broadcast_arrays(*squares)
@@ -234,10 +208,10 @@ def run_filter(
         p01 = p01 + q * noise_unit[1] + noise_fixed[1]
         p11 = p11 + q * noise_unit[2] + noise_fixed[2]
         covariance = p00, p01, p11
-        (nu, s, k0, _), updated_state = update_step(p, v, covariance, z, r)
+        (nu, s, _, _), updated_state = update_step(p, v, covariance, z, r)
         if not skips_update:
             p, v, covariance = updated_state
-        yield nu, s, k0, p, v, covariance
+        yield nu, s
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
@@ -255,7 +229,7 @@ def score_grid(
     """
     total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     for interval in intervals:
-        for nu, s, *_ in run_filter(interval, sigma_a_m_s2, sigma_z_m, None, weight):
+        for nu, s in run_filter(interval, sigma_a_m_s2, sigma_z_m, None, weight):
             total += 0.5 * (np.log(s) + nu**2 / s)
     return total
 

@@ -97,9 +97,6 @@
 
   // ------------------------------------------------------------ the table
 
-  const bar = (share) => fill(makeSvg("svg", { width: 72, height: 10, "aria-hidden": "true", class: "bar" }),
-    [["all", 68], ["", 68 * share]].map(([name, width]) => makeSvg("rect", { x: 2, y: 3, width, height: 4, class: name })));
-
   /* Mark of a σ ratio on a logarithmic axis with the consistent band; a triangle marks a ratio beyond its ends */
   const ratioMark = (ratio, against) => {
     const [low, high] = axis.ends.map(Math.log), width = 70;
@@ -115,7 +112,7 @@
   const nameColumn = Math.max(columns.findIndex(([, kind]) => kind === "name"), 0);
   const classes = (kind, visibleFrom, group) =>
     `${{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind] ?? ""} ${visibleFrom} ${group && `g-${group}`}`;
-  const cell = ([text = "", cellValue = "", below = "", style = "", share = ""], column) => {
+  const cell = ([text = "", cellValue = "", below = "", style = ""], column) => {
     const [, kind, group, visibleFrom] = columns[column];
     const hasStyle = style === "flags" || ["ratio", "full"].includes(kind);
     const node = make(column === nameColumn ? "th" : "td", "",
@@ -125,7 +122,6 @@
       node.append(...kind === "ratio" ? [ratioMark(Number(cellValue), style.split(" ")[1]), make("span", text)]
         : [style && kind !== "full" ? make("span", text, `chip ${style}`) : makeIsolated("span", text)]);
     }
-    if (share !== "") node.append(bar(share));
     if (below) node.append(makeIsolated("span", below, "file"));
     return node;
   };
@@ -169,9 +165,9 @@
   });
   headRow.append(...heads);
 
-  const draw = (count = size) => {
+  const draw = () => {
     for (const entry of entries) entry.row = null;
-    const shown = matches.slice(firstShown, firstShown + count);
+    const shown = matches.slice(firstShown, firstShown + size);
     body.replaceChildren(...shown.map(makeRow));
     for (const entry of shown) unfold(entry, entry.open);
     const last = Math.ceil(matches.length / size);
@@ -286,11 +282,6 @@
     box.addEventListener("change", groups);
   }
   addEventListener("resize", fit);
-  addEventListener("beforeprint", () => {
-    firstShown = 0;
-    draw(matches.length);
-  });
-  addEventListener("afterprint", () => draw());
   document.documentElement.classList.add("live");
   for (const node of queryAll(".controls, .keys")) node.hidden = false;
   frame.prepend(listTable);

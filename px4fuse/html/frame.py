@@ -49,15 +49,12 @@ class Cell:
         Second line in small print.
     style_class : str
         "" for text, "flags" for one flag per line, else the CSS class of a label.
-    bar : float or None
-        Length of a bar below the text, 0 to 1.
     """
 
     text: str = ""
     value: float | str | None = None
     below: str = ""
     style_class: str = ""
-    bar: float | None = None
 
 
 def text_cell(text: str, text_below: str = "") -> Cell:
@@ -66,7 +63,7 @@ def text_cell(text: str, text_below: str = "") -> Cell:
 
 
 def number_cell(value: float | None, text: str | None = None, text_below: str = "") -> Cell:
-    """Return a cell sorted by a number; empty if the value is None or not finite."""
+    """Return a cell sorted by a number; an empty cell if the value is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
     return Cell(f"{value:.4g}" if text is None else text, value, text_below)
@@ -100,7 +97,7 @@ class Row:
 
 
 def list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> Section:
-    """Return a section with a list of texts, marked as a warning if `is_warning`."""
+    """Return a section with a list of texts, highlighted if `is_warning`."""
     return ["list", title, texts, is_warning]
 
 
@@ -125,7 +122,7 @@ def table_section(
 
 
 def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
-    """Return a section with link texts and addresses of :func:`px4fuse.html.safe.local_link`."""
+    """Return a section with link texts and relative addresses."""
     return ["links", title, [row for row in rows if row[1]]]
 
 
@@ -135,7 +132,7 @@ def boxes_section(
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]] = (),
 ) -> Section:
-    """Return a section with input boxes for points and comments; the page exports them as CSV.
+    """Return a section with input boxes for points and comments, exported as CSV.
 
     Parameters
     ----------
@@ -230,10 +227,9 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a cell as a list without empty ends; value True: equal to the text."""
+    """Return the fields of a cell without empty ends; the value True is equal to the text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
-    bar = "" if cell.bar is None else round(cell.bar, 3)
-    fields = [cell.text, value, cell.below, cell.style_class, bar]
+    fields = [cell.text, value, cell.below, cell.style_class]
     while fields and fields[-1] == "":
         fields.pop()
     return fields

@@ -21,7 +21,7 @@ HARMFUL_CHARACTERS = re.compile(
 
 
 def clean(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
-    r"""Replace harmful characters and shorten the text to `max_length` characters.
+    r"""Replace characters that could change the display of other text, and shorten the text.
 
     >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
     ('a��b', 'abc…')
@@ -45,18 +45,18 @@ def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
 
 
 def inert_json(value: object) -> str:
-    """Encode as JSON in ASCII without <, > and &, so that HTML parsers find no markup."""
+    """Encode as JSON without <, > and &, so that it contains no HTML tags."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
 def policy_hash(text: str) -> str:
-    """Return the SHA-256 hash with which a content security policy allows a script or style."""
+    """Return the SHA-256 hash of a script or style for the content security policy."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def local_link(path: str) -> str:
-    r"""Return a relative path as a URL, "" for an absolute path, so that data cannot add web links.
+    r"""Return a relative path as a URL; "" for an absolute path, which could leave the folder.
 
     >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
     ('results/a%20b.json', 'javascript%3Aalert%281%29')
@@ -70,7 +70,7 @@ def local_link(path: str) -> str:
 
 @cache
 def load_template(name: str) -> Template:
-    """Load a template of the package; it cleans and escapes all inserted text."""
+    """Load a template of the package that cleans and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,
@@ -82,5 +82,5 @@ def load_template(name: str) -> Template:
 
 
 def read_asset(name: str, package: str = "px4fuse.html") -> str:
-    """Read a text file of a package, by default of the files shared by all pages."""
+    """Read a text file of a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

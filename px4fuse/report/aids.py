@@ -1,4 +1,4 @@
-"""Page on EKF2's aids: table of verdicts and normalised innovations of each aid."""
+"""Page on the aiding sources of EKF2: a table of verdicts, and plots of the innovations."""
 
 from collections.abc import Iterator, Mapping
 
@@ -13,6 +13,7 @@ from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict, write_findings
 
 TITLE = "Aiding sources of EKF2"
@@ -21,14 +22,13 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
-MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge of the axes
-MAX_DRAWN_INNOVATIONS = 400  # maximum number of drawn innovations per component of an aiding source
-# Aiding sources that add this page to a comparison, if EKF2 fused one of them
+MAX_NORMALISED = 4.0  # maximum ν/√S of the plots; larger values are drawn as triangles
+# Aiding sources of which EKF2 must fuse at least one for this page in the report of a comparison
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix on aiding sources if EKF2 fused a horizontal one besides vision."""
+    """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS or optical flow."""
     page = Page(appendix_title(TITLE), LEAD_TEXT)
     aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:
@@ -37,7 +37,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write the table of aiding sources and return them; {} if EKF2 fused vision only."""
+    """Write and return the aiding sources; {} if EKF2 fused neither GNSS nor optical flow."""
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
@@ -50,7 +50,7 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
 
 
 def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw EKF2's aiding sources on the cover of a flight without a position source."""
+    """Draw EKF2's aiding sources of a flight without a position source."""
     page = Page(TITLE, LEAD_TEXT)
     write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
@@ -60,7 +60,7 @@ def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
 def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
     """Write the table of EKF2's aiding sources and the findings."""
     write_aids(page, analysis.aids)
-    page.heading("Findings", 10.5, above=12.0)
+    page.heading("Findings")
     write_findings(page, findings)
 
 
@@ -83,21 +83,19 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             f"{aid.longest_gap_duration_s:.1f}",
             noise,
         ]
-        for name, axis in aid.axes.items():
-            low, high = axis.nis_band
-            rows.append(
-                [
-                    *aid_cells,
-                    name,
-                    f"{axis.samples}",
-                    format_number(axis.nis_mean),
-                    f"{low:.2f} – {high:.2f}",
-                    f"{axis.mean_normalised_innovation:+.2f}",
-                ]
-            )
+        axis_rows: list[list[Cell]] = [
+            [
+                name,
+                f"{axis.samples}",
+                format_number(axis.nis_mean),
+                "{:.2f} – {:.2f}".format(*axis.nis_band),
+                f"{axis.mean_normalised_innovation:+.2f}",
+            ]
+            for name, axis in aid.axes.items()
+        ] or [[""] * 5]
+        for axis_cells in axis_rows:
+            rows.append([*aid_cells, *axis_cells])
             aid_cells = [""] * len(aid_cells)
-        if not aid.axes:
-            rows.append([*aid_cells, *[""] * 5])
     page.table(
         [
             "aiding source",
@@ -126,7 +124,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
 def format_aid_verdict(aid: AidResult) -> str:
     """Format the verdict on an aiding source, with the factor between reported and actual σ."""
     if aid.verdict == "not_fused":
-        return f"not fused for {aid.longest_gap_duration_s:.1f} s"
+        return f"not fused for up to {aid.longest_gap_duration_s:.1f} s"
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 
@@ -135,11 +133,11 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
-    page.heading("Normalised innovations of each aiding source", above=8.0)
+    page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused; in grey times fusion was disabled. Values beyond "
-        f"±{MAX_NORMALISED:g} are drawn at the edge."
+        f"±{MAX_NORMALISED:g} are drawn as triangles."
     )
     for name in fused_names:
         _draw_aid_panel(
@@ -157,13 +155,8 @@ def _draw_aid_panel(
     )
     for axis in log.axes:
         normalised = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
-        clipped = normalised.clip(-MAX_NORMALISED, MAX_NORMALISED).to_numpy()
-        for mask, dot_style in ((is_fused, style.EKF2_DOTS), (~is_fused, style.EKF2_REJECTED)):
-            if mask.any():
-                dots = style.decimate_series(
-                    samples.index.to_numpy()[mask], clipped[mask], MAX_DRAWN_INNOVATIONS
-                )
-                axes.plot(*dots, **dot_style | {"ms": 1.4})
+        for mask, dot_style in ((is_fused, style.DOTS["EKF2"]), (~is_fused, style.EKF2_REJECTED)):
+            draw_dots(axes, normalised[mask], MAX_NORMALISED, dot_style | {"ms": 1.4})
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if log.enabled is not None:

@@ -11,17 +11,25 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, SIGMA_RATIO_BANDS, Action, Card, Rerun, Verdict
-from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.card.model import (
+    AXIS_TICKS,
+    FILTER_NAMES,
+    SIGMA_RATIO_BANDS,
+    Card,
+    Rerun,
+    Verdict,
+    axis_fraction,
+)
 from px4fuse.card.verdicts import verdicts
+from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import Reference
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
-    FILTER_NAMES,
     LABELLED_TICKS,
     MARKS,
     QUANTITIES,
+    SEVERITY_SIGNS,
+    band_limits,
     format_spans,
     format_target,
     marked_actions,
@@ -30,14 +38,7 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-SEVERITY_SIGNS = {
-    "error": "■ ERROR",
-    "warning": "▲ WARNING",
-    "note": "● NOTE",
-    "clean": "✓ NO FAULT",
-    "refused": "✕ REFUSED",
-}
-# SVG paths of the mark of a ratio; triangles mark ratios beyond the ends of the axis
+# SVG path of the symbol for a σ ratio: against source, ground truth, and beyond the axis ends
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -45,11 +46,11 @@ MARK_PATHS = {
     "above": "M-5-7L7 0L-5 7z",
 }
 SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-HALF_HEIGHT = 5  # half the height (pixels) of the end ticks of an interval
+HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
 
 
 def card_of(analysis: Analysis) -> Card:
-    """Return the card of an analysis that has a request, with the path of the log as typed."""
+    """Return the diagnosis card of an analysis, with the path of the log as typed."""
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
@@ -59,12 +60,7 @@ def card_of(analysis: Analysis) -> Card:
     return with_typed_path(card, analysis.request.log)
 
 
-def card_html(
-    card: Card,
-    *,
-    is_open: bool = False,
-    has_apply: bool = False,
-) -> str:
+def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
     """Return the card as an HTML element; :func:`card_style` has its style.
 
     Parameters
@@ -82,19 +78,7 @@ def card_html(
         figure=axis_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
-        more=" and ".join(
-            text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
-        ).capitalize(),
-        first_actions=[
-            row for row in marked_actions(card.causes[0]) if _is_alternative_or_command(row)
-        ]
-        if card.causes
-        else [],
-        rows_of=lambda cause: [
-            row
-            for row in marked_actions(cause)
-            if cause is not card.causes[0] or not _is_alternative_or_command(row)
-        ],
+        marked_actions=marked_actions,
         rerun_rows=_rerun_rows,
         signs=SEVERITY_SIGNS,
         target=format_target,
@@ -104,7 +88,7 @@ def card_html(
 
 
 def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
-    """Return the verdicts on their logarithmic axis as an HTML figure.
+    """Draw σ ratios on their logarithmic axis as an HTML figure.
 
     Parameters
     ----------
@@ -133,55 +117,39 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return an HTML figure of the four verdicts for each analysed axis."""
+    """Return an HTML figure with the four σ ratios of KF and EKF2 for each axis."""
     return "".join(
         axis_html(verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 
 
-def band_limits() -> str:
-    """Format the limits of the consistent ratios against source and ground truth.
-
-    >>> band_limits()
-    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
-    """
-    return ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
-    )
-
-
 def card_style() -> str:
-    """Return the style sheet of the card; its colours are in ``html/colours.css``."""
+    """Return the style sheet of the diagnosis card, without its colours."""
     return read_asset("card.css", "px4fuse.report")
 
 
 def notebook_html(card: Card) -> str:
-    """Return the card with its style and colours, for a notebook."""
+    """Return the diagnosis card with its style and colours, for a notebook."""
     colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the verdicts on the axis for screen readers.
+    """Describe the σ ratios and their verdicts for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
     """
-    return " ".join(
-        f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}: "
-        + (f"not evaluated, {verdict.reason}." if verdict.ratio is None else f"{_value(verdict)}.")
-        for verdict in verdicts
-    )
-
-
-def _value(verdict: Verdict) -> str:
-    explained = ", explained" if verdict.is_explained else ""
-    return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
-
-
-def _is_alternative_or_command(row: tuple[str, Action]) -> bool:
-    return bool(row[0] or row[1].commands)
+    sentences = []
+    for verdict in verdicts:
+        value = f"not evaluated, {verdict.reason}"
+        if verdict.ratio is not None:
+            explained = ", explained" if verdict.is_explained else ""
+            value = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained}"
+        quantity = f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}"
+        sentences.append(f"{quantity}: {value}.")
+    return " ".join(sentences)
 
 
 def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
@@ -193,10 +161,12 @@ def _percent(ratio: float) -> str:
 
 
 def _drawing(verdict: Verdict) -> dict[str, Any]:
-    """Return the SVG attributes of the band, the 95 % interval and the mark of a ratio."""
+    """Return the SVG attributes for one σ ratio: its consistent band, 95 % interval and mark."""
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in SIGMA_RATIO_BANDS[verdict.against])
+    fraction = axis_fraction(verdict.ratio)
+    symbol = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
     marks = []
     if verdict.interval is not None:
         left_percent, right_percent = (_percent(max(end, 1e-9)) for end in verdict.interval)
@@ -211,10 +181,5 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
         ),
         "interval": [Markup(mark) for mark in marks],
         "mark": Markup(f' x="{_percent(verdict.ratio)}%"'),
-        "path": MARK_PATHS[_shape(verdict.ratio, verdict.against)],
+        "path": MARK_PATHS[symbol],
     }
-
-
-def _shape(ratio: float, reference: Reference) -> str:
-    fraction = axis_fraction(ratio)
-    return reference if 0.0 <= fraction <= 1.0 else "above" if fraction > 1.0 else "below"

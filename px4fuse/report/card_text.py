@@ -3,16 +3,18 @@
 Commands and the headline never wrap; other texts wrap with a hanging indent.
 """
 
+import json
 import re
 import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from msgspec.structs import replace
+from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
     AXIS_TICKS,
+    FILTER_NAMES,
     MAX_NOTES,
     SIGMA_RATIO_BANDS,
     Action,
@@ -21,32 +23,37 @@ from px4fuse.card.model import (
     Cause,
     Rerun,
     Verdict,
+    axis_fraction,
 )
-from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100
 AXIS_WIDTH = 37
-# Number of columns before the axis of ratios, and before the text beside a label
-AXIS_INDENT, TEXT_INDENT = 58, 11
-# Maximum length of a command beside its label; a longer one is on a separate line
+AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
+TEXT_INDENT = 11  # number of characters left of a text with a label
+# Maximum length of a command on the line of its label; longer commands have their own line
 MAX_COMMAND_LENGTH = 74
-# Ticks of the axis of ratios that have room for a label
+# Ticks of the axis of σ ratios that have a label
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
-FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
-# Severities that a headline names differently
-SEVERITY_LABELS = {"clean": "ok", "note": "note"}
+SEVERITY_SIGNS = {
+    "error": "■ ERROR",
+    "warning": "▲ WARNING",
+    "note": "● NOTE",
+    "clean": "✓ NO FAULT",
+    "refused": "✕ REFUSED",
+}
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
-# Replacements of characters for terminals whose encoding lacks them
+# ASCII replacements of characters, for terminals with an ASCII encoding
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
 AIDS_HEADING = (
-    "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
-    "barometer, magnetometer and gravity that is usual and not a fault."
+    "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
+    "is too large. For barometer, magnetometer and gravity this is usual and not a fault."
 )
 CONSOLE_NOTE = "Console means the MAVLink Console of QGroundControl."
 
@@ -118,7 +125,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, place: str) -> list[str]:
-    """Format the first notes of a card, and count the others, which stand at ``place``."""
+    """Format the first notes of a card, and the number of the other notes with their place."""
     texts = [
         " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
         for note in card.notes[:MAX_NOTES]
@@ -128,15 +135,17 @@ def note_texts(card: Card, place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a card: where to read more, and what the console of a command is."""
-    has_console = any(action.where == "console" for action in _all_actions(card))
+    """Yield the last lines of a card: commands for details, and an explanation of the console."""
+    has_console = any(
+        action.where == "console" for cause in card.causes for _, action in marked_actions(cause)
+    )
     sentences = ["More: -v.", *([CONSOLE_NOTE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped_lines(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
-    """Replace the file name of the log in all commands of a card by the path as typed.
+    """Replace the log's file name in all commands of a card by the path that the user typed.
 
     >>> from px4fuse.card.model import Identity
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
@@ -145,42 +154,18 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
     ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
     """
-    if path is None or path == card.identity.file:
+    if path is None:
         return card
-    name = card.identity.file
-
-    pattern = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(name))}")
-
-    def with_path(text: str) -> str:
-        return pattern.sub(lambda match: f"{match[1]}{quote_command([path])}", text)
-
-    def typed(action: Action) -> Action:
-        commands = tuple(
-            quote_command([path if word == name else word for word in shlex.split(command)])
-            if action.where == "shell"
-            else command
-            for command in action.commands
-        )
-        return replace(action, commands=commands, sentence=with_path(action.sentence))
-
-    causes = tuple(
-        replace(
-            cause,
-            actions=tuple(map(typed, cause.actions)),
-            alternatives=tuple(tuple(map(typed, group)) for group in cause.alternatives),
-        )
-        for cause in card.causes
+    name, typed_name = (
+        json.dumps(text)[1:-1] for text in (shlex.quote(card.identity.file), quote_command([path]))
     )
-    return replace(
-        card,
-        causes=causes,
-        do_this=tuple(map(with_path, card.do_this)),
-        notes=tuple(replace(note, action=with_path(note.action)) for note in card.notes),
-    )
+    command = re.compile(rf"(px4fuse \w+ ){re.escape(name)}")
+    content = command.sub(lambda match: match[1] + typed_name, json.dumps(to_builtins(card)))
+    return convert(json.loads(content), Card)
 
 
 def to_ascii(text: str) -> str:
-    """Replace the characters of :data:`ASCII_REPLACEMENTS`, for terminals that cannot print them.
+    """Replace characters that ASCII terminals cannot print.
 
     >>> to_ascii("error ÷ σ 7.2 → 1.2")
     'error / sigma 7.2 -> 1.2'
@@ -188,8 +173,19 @@ def to_ascii(text: str) -> str:
     return text.translate(ASCII_REPLACEMENTS)
 
 
+def band_limits() -> str:
+    """Format the limits of the consistent ratios against source and ground truth.
+
+    >>> band_limits()
+    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
+    """
+    return ", ".join(
+        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
+    )
+
+
 def axis_text(ratio: float | None, reference: Reference) -> str:
-    """Draw one ratio on the logarithmic axis with the band of consistent ratios.
+    """Draw one σ ratio on a logarithmic axis with the band of consistent ratios.
 
     >>> axis_text(0.93, "source")
     '────────────────░●░░░────────────────'
@@ -225,7 +221,7 @@ def _identity_line(card: Card) -> Iterator[Line]:
 
 def headline(card: Card) -> Iterator[Line]:
     """Yield the line with severity, id and headline."""
-    label = SEVERITY_LABELS.get(card.severity, card.severity)
+    label = "ok" if card.severity == "clean" else card.severity
     name = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{name}: {card.headline}", STYLES[card.severity])
 
@@ -249,7 +245,7 @@ def _cause_lines(cause: Cause) -> Iterator[Line]:
 
 
 def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, with "EITHER " and "OR " before alternatives."""
+    """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
         for place, alternative in enumerate(cause.alternatives)
@@ -259,7 +255,7 @@ def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
 
 
 def format_target(action: Action) -> str:
-    """Format the target of an action with the place where its commands are typed."""
+    """Format the target of an action with the program for its commands: "EKF2 (console)"."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -289,7 +285,7 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the re-run table, each with its heading; empty columns are left out."""
+    """Return the columns of the table of re-runs with their headings; empty columns are omitted."""
     columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
@@ -305,13 +301,13 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def rerun_start(reruns: Sequence[Rerun]) -> str:
-    """Return the sentence on the time from which EKF2's replay predicts, "" without a replay."""
+    """Return the sentence on the start time of EKF2's replay; "" if EKF2 was not replayed."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
     if not starts:
         return ""
     return (
-        f"EKF2 (replay) is a prediction: both values are of the replay from {min(starts):.0f} s "
-        "on, without gaps."
+        f"EKF2 (replay) is a prediction. Both values are from the replay after {min(starts):.0f} "
+        "s, without gaps."
     )
 
 
@@ -338,10 +334,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line("")
     heading = "Reported uncertainty: RMS of actual ÷ reported"
     yield from _wrapped_lines(f"{heading}{axis_text}", "", "  ")
-    limits = ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
-    )
-    legend = f"  ░ consistent ({limits})"
+    legend = f"  ░ consistent ({band_limits()})"
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
@@ -390,7 +383,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
 
 
 def format_spans(cause: Cause) -> str:
-    """Format the times of a cause, from the first to the last; "" for the whole flight."""
+    """Format the time from the begin to the end of a fault; "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first_s, last_s = cause.spans_s[0][0], cause.spans_s[-1][1]
@@ -405,10 +398,3 @@ def _labelled_lines(label: str, text: str) -> Iterator[Line]:
 def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Line]:
     if text:
         yield Line(text, "", first_indent, indent, wraps=True)
-
-
-def _all_actions(card: Card) -> Iterator[Action]:
-    for cause in card.causes:
-        yield from cause.actions
-        for alternative in cause.alternatives:
-            yield from alternative

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
@@ -13,16 +15,16 @@ from px4fuse.findings.source_clock import clock_offset_option_s
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
-from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
+from px4fuse.report.style import KF_BAND_COLOUR, LINES, Axes
 from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes
-MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, in nats below the maximum
-# Range of drawn time offsets on each side of the estimate, in half 95 % intervals
+MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
+# Maximum distance of a drawn time offset from the estimate, in half widths of its 95 % interval
 CURVE_HALF_WIDTH = 2.5
-# Largest time offset (s) without an action: one EKF2 step (EKF2_PREDICT_US)
+# Maximum time offset (s) without a recommended action: one EKF2 step (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010
-# Ids of the findings for which the report has this page
+# Ids of findings on the time offset; with one of them the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
@@ -35,7 +37,7 @@ def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 
 def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the report has the appendix on the time offset: a finding, or no estimate."""
+    """Return True if the time offset is a finding or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -64,36 +66,23 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
         typed_offset = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
-    configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
-    age_s = comparison.source.age_s
-    min_delay_s, max_delay_s = age_s - high, age_s - low
-    if (
-        configured_delay_ms is not None
-        and min_delay_s - NEGLIGIBLE_OFFSET_S
-        <= configured_delay_ms * 1e-3
-        <= max_delay_s + NEGLIGIBLE_OFFSET_S
-    ):
-        advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
-    elif (
-        configured_delay_ms is not None and 1e3 * (age_s - offset) > PARAMETERS[delay_name].maximum
-    ):
-        advice["PX4"] = (
-            f"{delay_name} cannot exceed {PARAMETERS[delay_name].maximum:g} ms. Correct the "
-            "sender's clock."
-        )
-    elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
-        advice["PX4"] = (
-            f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
-            f"{delay_name} cannot be negative. Correct the sender's clock."
-        )
-    elif configured_delay_ms is not None:
-        ml_delay_ms, min_ms, max_ms = (
-            max(1e3 * s, 0.0) for s in (age_s - offset, min_delay_s, max_delay_s)
-        )
-        advice["PX4"] = (
-            f"Set {delay_name} to {ml_delay_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
-            f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
-        )
+    delay_name, age_s = aid_of(comparison).delay, comparison.source.age_s
+    if (configured_delay_ms := delay_ms(comparison)) is not None:
+        ml_delay_ms, min_ms, max_ms = (1e3 * (age_s - s) for s in (offset, high, low))
+        largest_ms, tolerance_ms = PARAMETERS[delay_name].maximum, 1e3 * NEGLIGIBLE_OFFSET_S
+        if min_ms - tolerance_ms <= configured_delay_ms <= max_ms + tolerance_ms:
+            advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
+        elif max_ms < 0.0 or min_ms > largest_ms:
+            advice["PX4"] = (
+                f"The maximum-likelihood {delay_name} is {ml_delay_ms:.0f} ms, but PX4 allows 0 to "
+                f"{largest_ms:g} ms. Correct the sender's clock."
+            )
+        else:
+            best_ms, min_ms, max_ms = np.clip((ml_delay_ms, min_ms, max_ms), 0.0, largest_ms)
+            advice["PX4"] = (
+                f"Set {delay_name} to {best_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
+                f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
+            )
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
@@ -117,7 +106,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on the time offset if it is a finding or cannot be estimated."""
+    """Draw the appendix on the time offset of the position source if :func:`has_page`."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
@@ -131,12 +120,12 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
             "same positions, so it is not used."
         ),
     )
-    page.write_labelled_texts(clock_advice(analysis, clock), size=8.5)
+    page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
-        f"Maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
-        "interval also includes the IMU noise, so it is wider than the curve shows. "
-        f"{clock.count} measurements."
+        f"The log-likelihood has its maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to "
+        f"{high:+.3f} s. The interval also includes the IMU noise, so it is wider than the curve "
+        f"shows. {clock.count} measurements."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
@@ -147,7 +136,7 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
     (low, high), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)
+    axes.plot(clock.curve_s, clock.curve_drop, **LINES["KF"])
     axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
     half_width = CURVE_HALF_WIDTH * max(high - estimate_s, estimate_s - low)

@@ -1,4 +1,4 @@
-"""Appendix: consistency tests of KF and EKF2 (mean NIS, distribution, whiteness)."""
+"""Appendix on the consistency of KF and EKF2: mean NIS, distribution and whiteness tests."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary, Unt
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
 from px4fuse.report.panels import normalised_innovations
-from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
+from px4fuse.report.phrases import (
+    VERDICT_HEAD,
+    filters_by_name,
+    format_noise_estimate,
+    format_settings,
+    verdict_rows,
+)
 from px4fuse.report.style import (
     DOTS,
-    KF_BAND_COLOUR,
     KF_COLOUR,
     LINES,
     MUTED_COLOUR,
@@ -35,19 +41,20 @@ from px4fuse.report.style import (
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Maximum of the density axis, at which the normal curve (maximum 0.4) is visible
+# Maximum of the density axis, so that the normal density (maximum 0.4) remains visible
 MAX_DENSITY = 1.6
-# Maximum p value of the Ljung-Box test for innovations that the caption calls not white
+# Maximum p value of the Ljung-Box test for innovations that are not white
 MAX_NON_WHITE_P = 0.01
-RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # heights (points)
-BAND_GREY = "#dcdcdc"
-# Label of each statistic that a re-run changes, and the power of the statistic that is printed
+RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
+LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
+LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
+# Label of each tested statistic, and the exponent with which its value is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
     "difference": ("KF - EKF2 (m)", 1.0),
 }
-
+NOISE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
 
 Series = Mapping[str, "pd.Series[float]"]
 
@@ -90,25 +97,34 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
         for axes in (left, right):
-            draw_legend_above(axes, handlelength=1.4)
+            draw_legend_above(axes)
         page.add_columns(left_page, right_page)
     else:
         kf_summary = result.filters["kf"]
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
-    page.heading("All axes", above=12.0)
+    page.heading("All axes")
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(
         head,
         verdict_rows(analysis.axes.values(), _statistic_cells),
         right_aligned_columns=(2, 5, 6, 7, 8),
     )
+    noise_rows = [
+        [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
+        for name, tuning in analysis.tuning.items()
+        if isinstance(tuning, AxisTuning)
+    ]
+    if noise_rows:
+        page.heading("Maximum-likelihood noises of KF, with 95 % intervals")
+        page.table(NOISE_HEAD, noise_rows, right_aligned_columns=(1, 2))
+        page.write(f"This report uses {format_settings(analysis.settings)}.")
     _write_causes(page, analysis)
     yield page
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs of KF and EKF2 with one change along the main axis."""
+    """Write the table of tested causes: KF and EKF2 re-run with one changed setting each."""
     axis = analysis.main.axis
     tested: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
@@ -132,14 +148,14 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
         )
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.label}", above=12.0)
+    page.heading(f"Tested causes along {axis.label}")
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
         (
-            "Each row is a re-run with one change. 'all': the change brings the quantity "
-            "into its band. Otherwise: explained share of the logarithm of the quantity (for "
-            "distances: of the mean square). A share of 50 % or more counts as the cause."
+            "Each row is a re-run with one changed setting. 'all': the change makes the quantity "
+            "consistent. Otherwise: reduction of the logarithm of the quantity (for "
+            "distances: of the mean square). A change with 50 % or more is a cause."
         ),
         colour=MUTED_COLOUR,
     )
@@ -167,11 +183,8 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
         time = values.index[drawn_counts - 1]
-        if name == "KF":
-            axes.fill_between(time, low, high, color=BAND_GREY, lw=0, label="95 % band KF")
-        else:
-            axes.plot(time, low, **_thin_line_style(name))
-            axes.plot(time, high, **_thin_line_style(name), label="95 % band EKF2")
+        axes.plot(time, low, **_thin_line_style(name))
+        axes.plot(time, high, **_thin_line_style(name), label=f"95 % band {name}")
         settled_nis = running.iloc[len(running) // 4 :]
         lowest_nis, highest_nis = (
             min(lowest_nis, 0.7 * settled_nis.min()),
@@ -185,7 +198,7 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
 def _draw_histogram(axes: Axes, series: Series) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal_density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(x, normal_density, color=BAND_GREY, lw=0, label="normal")
+    axes.fill_between(x, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in series.items():
         density, _ = np.histogram(
@@ -208,18 +221,8 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
         dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
         axes.plot(positions, r, **dots, label=name)
         bound = _whiteness_bound(values)
-        if name == "KF":
-            axes.axhspan(
-                -bound,
-                bound,
-                color=KF_BAND_COLOUR,
-                lw=0,
-                zorder=0.5,
-                label="95 % band of white noise",
-            )
-        else:
-            for level in (-bound, bound):
-                axes.axhline(level, **_thin_line_style(name))
+        axes.axhline(-bound, **_thin_line_style(name))
+        axes.axhline(bound, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -228,7 +231,7 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
 
 
 def _whiteness_bound(values: pd.Series[float]) -> float:
-    """Return the half width of the 95 % band for the autocorrelation of white innovations."""
+    """Return the half width of the 95 % band of the autocorrelation of white noise."""
     return float(1.96 / np.sqrt(len(values)))
 
 
@@ -236,12 +239,11 @@ def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
     for name, values in series.items():
         consistency = filters_by_name(result)[name]
-        assert isinstance(consistency, Consistency)  # else the filter has no innovations
+        assert isinstance(consistency, Consistency)  # filters without innovations have no series
         r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
         if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):
-            cause = "lags" if r > 0.0 else "follows measurement noise"
-            interpretation = f"the filter {cause}"
+            interpretation = f"{name} {'lags' if r > 0.0 else 'follows measurement noise'}"
         sentences.append(
             f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "
             f"{interpretation}."

@@ -1,6 +1,6 @@
-"""Cover of a report: the diagnosis card, and panels that fill the rest of the page.
+"""Cover of a report: the diagnosis card, and plots below it.
 
-Texts and numbers are those of the card; ``cover.typ`` places them.
+``cover.typ`` places the texts of the card.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,22 +10,25 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
     AXIS_ENDS,
     AXIS_TICKS,
+    FILTER_NAMES,
     SIGMA_RATIO_BANDS,
     Action,
     AidRow,
     Card,
     Cause,
     Verdict,
+    axis_fraction,
 )
-from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.core.text import format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_HEADING,
-    FILTER_NAMES,
     MARKS,
     MAX_COMMAND_LENGTH,
     QUANTITIES,
+    SEVERITY_SIGNS,
+    band_limits,
     format_spans,
     marked_actions,
     note_texts,
@@ -38,11 +41,7 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-# Maximum number of changed settings in the head; with more, their number is printed
-MAX_CHANGED_SETTINGS = 3
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
-SEVERITY_SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
-SEVERITY_WORDS = {"error": "ERROR", "warning": "WARNING", "note": "NOTE", "clean": "NO FAULT"}
 AXIS_TITLE = "Is the reported uncertainty right?"
 AXIS_TEXT = "RMS of actual ÷ reported"
 TERMS_NOTE = (
@@ -56,7 +55,7 @@ ALL_FINDINGS = "All findings"
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the cover: measure the height that the card leaves, and draw the panels for it."""
+    """Draw the cover: the diagnosis card, and plots in the height below it."""
     page = Page()
     block = add_card(page, results.card)
     write_panels(block, analysis, results.card, free_height(page))
@@ -64,28 +63,25 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 
 def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
-    """Draw the cover of a flight without a position source; the aids follow on the same page."""
+    """Draw the cover of a flight without a position source."""
     page = Page()
     add_card(page, results.card)
     yield page
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add the texts of a card to a page; the panels go into ``blocks`` of the returned block."""
+    """Add the texts of a card to a page; plots are added to ``blocks`` of the result."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
-    further_causes_text = (
-        [f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"] if card.more_causes else []
-    )
+    more_causes = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
-        word=SEVERITY_WORDS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
         file=_shorten_middle(identity.file),
         student=[text for text in (identity.student, identity.student_id) if text],
         flight=" · ".join(filter(None, flight)),
-        changed=_format_changed(identity.changed),
+        changed=f"KF changed: {', '.join(identity.changed)}" if identity.changed else "",
         settings=f"KF: {identity.settings}" if identity.settings else "",
         parameters=", ".join(identity.parameters),
         headline=card.headline,
@@ -97,7 +93,7 @@ def add_card(page: Page, card: Card) -> Block:
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
         causes_legend=_causes_legend(card.causes),
         causes=[_cause_data(number, cause) for number, cause in enumerate(card.causes, start=1)],
-        more_causes="".join(further_causes_text),
+        more_causes=more_causes if card.more_causes else "",
         difference=card.difference,
         notes=note_texts(card, f"in {ALL_FINDINGS}"),
         terms=AIDS_TERMS if card.aids else TERMS_NOTE,
@@ -109,7 +105,7 @@ def add_card(page: Page, card: Card) -> Block:
 
 
 def free_height(page: Page) -> float:
-    """Return the height (pt) that is left below the card on the page where it ends."""
+    """Return the height (points) below the card on the last page of the card."""
     return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
 
 
@@ -125,31 +121,15 @@ def _shorten_middle(name: str) -> str:
     )
 
 
-def _format_changed(changed_options: Sequence[str]) -> str:
-    if not changed_options:
-        return ""
-    text = (
-        ", ".join(changed_options)
-        if len(changed_options) <= MAX_CHANGED_SETTINGS
-        else f"{len(changed_options)} settings"
-    )
-    return f"KF changed: {text}"
-
-
 def _axis_data(card: Card) -> dict[str, Any]:
-    """Return the heading and the rows of the logarithmic axis of σ ratios."""
-    limits = [
-        f"{MARKS[name]} {low:g} to {high:g}"
-        for name, (low, high) in SIGMA_RATIO_BANDS.items()
-        if name == "source" or not card.aids
-    ]
+    """Return heading, ticks and rows of the logarithmic axis of σ ratios."""
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
     ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
     axis_text = f", {card.effect.axis}" if card.effect else ""
     return {
         "axis_title": AXIS_TITLE,
         "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
-        "axis_legend": f"grey: consistent ({', '.join(limits)}){intervals} · ◀ ▶ beyond {ends}",
+        "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ beyond {ends}",
         "ticks": [
             {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
         ],
@@ -189,7 +169,7 @@ def _aid_row(row: AidRow) -> dict[str, Any]:
 def _ratio_marks(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the places (0 to 1) of a ratio, its interval and its band on the axis."""
+    """Return the positions of a σ ratio, its interval and its band on the axis (0 to 1)."""
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
     beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {

@@ -1,41 +1,28 @@
-"""Panels of the cover: map, position errors of KF and EKF2, innovations.
+"""Plots of the cover: map, position errors of KF and EKF2, normalised innovations.
 
-Values outside of a panel are marked by triangles at its edge.
+Values outside of a plot over time are drawn as triangles at its edge.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.build import horizontal_resets
-from px4fuse.card.model import Card
-from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.card.model import FILTER_NAMES, Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight.model import Ekf2, Truth
-from px4fuse.report import style
-from px4fuse.report.card_text import FILTER_NAMES
-from px4fuse.report.event_marks import (
-    DROPOUT_BAND,
-    GAP_BAND,
-    LANDING_MARK,
-    OUTLIER_MARK,
-    TAKE_OFF_MARK,
-    outlier_times,
-    visible_times,
-)
+from px4fuse.report import event_marks, style
 from px4fuse.report.page import (
     AXES_RIGHT,
     AXIS_LABEL_HEIGHT,
-    COLUMN_GAP,
-    PAGE_WIDTH,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
     Block,
@@ -44,70 +31,62 @@ from px4fuse.report.page import (
     line_count,
     text_width,
 )
-from px4fuse.report.panels import normalised_innovations
-from px4fuse.report.style import LINES, Artist, Axes, draw_curve
+from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
+from px4fuse.report.style import LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum length / width of the track for panels that fill the page width
+# Minimum length / width of a track for plots that fill the page width
 MIN_LONG_RATIO = 2.2
-# Least and largest height (pt) of the map, with title and labels
+# Limits (points) of the height of the map, with title and labels
 MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Least total heights (pt) of the panels in two columns and in three columns
-MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+# Minimum height (points) of all plots; with less height, the plots are on the next page
+MIN_HEIGHT = 38.0 * POINTS_PER_MM
+# Minimum height (points) of all plots for a plot of the innovations
+MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
+# Limits (points) of the height of the innovation plot, with title and labels
 INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+# Minimum height (points) of each plot of a position error
 MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
-# Total height (pt) of the panels on the next page, if the card fills the first one
+# Total height (points) of the plots on the next page
 NEXT_PAGE_HEIGHT = 160.0 * POINTS_PER_MM
-# Heights (pt): title with gaps, each further line of it, gap above the legend, unused rest
-TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE_HEIGHT = 16.5, 10.5, 11.0, 4.0
-# Minimum height (pt) of the innovations for ticks at ±2 besides -4, 0 and 4
+TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
+TITLE_LINE = 10.5  # height (points) of each further line of a title
+# Height (points) above the legend and below the last plot
+UNUSED_HEIGHT = 15.0
+# Minimum height (points) of the innovation plot for ticks at ±2 in addition to -4, 0 and 4
 MIN_TICKS_HEIGHT = 48.0
-MIN_WIDE_PANEL = 200.0  # minimum width (pt) of a panel for six ticks of the time axis
-LEFT_MARGIN = 38.0  # width (pt) for tick and axis labels left of the axes
-# Fraction of the height of all panels for the innovations, and for the map
-INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
-# Maximum number of drawn innovations per filter; those beyond the scale are always drawn
-MAX_DRAWN_INNOVATIONS = 400
+# Minimum width (points) of a plot for six ticks of the time axis
+MIN_WIDE_PANEL = 200.0
+LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
+# Fraction of the height of all plots that the innovation plot fills
+INNOVATION_FRACTION = 0.22
+# Fraction of the height of all plots that the map fills
+MAP_FRACTION = 0.25
+# Half height of the innovation plot in √S
 MAX_NORMALISED = 4.0
-# Height (pt) below the axes, without and with labels of the time axis
+# Height (points) below the axes, without and with labels of the time axis
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
-MAP_MARGIN, MAP_REACH, MIN_MAP_LENGTH_M = 1.08, 0.25, 0.5
-# Minimum distance between two triangles of a track, as a fraction of the map's length
-MIN_EXIT_DISTANCE = 0.02
-# Maximum part of the scale that a curve fills if the title calls it flat
-FLAT_SHARE = 0.1
-FLAT_INNOVATIONS = 1.0
+# Ratio of the map's length to the length of the tracks
+MAP_MARGIN = 1.08
+# Maximum distance of a drawn track from the positions, as a fraction of their extent
+MAP_REACH = 0.25
+MIN_MAP_LENGTH_M = 0.5
 # Maximum ratio of the largest to the smallest σ for a title with one value of σ
-MAX_SIGMA_SPREAD = 1.5
+MAX_SIGMA_RATIO = 1.5
 # Time (s) in which σ settles at the start; titles do not include its values
 SETTLING_S = 2.0
-# Markers of the innovations; the title of their panel shows the same symbols
-INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
-    "KF": style.KF_DOTS,
-    "EKF2": style.EKF2_DOTS | {"ms": 2.8, "mew": 0.6, "mfc": "none"},
-}
-# Minimum distance of two marks as a fraction of the axes; of closer marks one is drawn
-MIN_MARK_DISTANCE = 1.0 / 150.0
-GAP_HATCH: dict[str, Any] = {
-    **GAP_BAND,
-    "facecolor": "none",
-}  # no fill, so that σ in the gap is visible
-RESET_LINE = style.line_style(style.EKF2_COLOUR, 1.0, (0, (1, 1)))
-REJECTED_MARK = style.dot_style("black", "|", 5.0, 0.7)
 Coordinates = tuple[Array, Array]
-MapLimits = tuple[tuple[float, float], tuple[float, float]]
-DrawStrip = Callable[[Axes], None]
 
 
-class Strip(NamedTuple):
+class TimePlot(NamedTuple):
     """Small plot over time: title, and the function that draws it."""
 
     title: str
-    draw: DrawStrip
+    draw: Callable[[Axes], None]
 
 
 class FlightMap(NamedTuple):
-    """Flight from above: tracks in metres to the right and upwards, and the axis labels.
+    """Tracks seen from above, in metres to the right and upwards, with the axis labels.
 
     Of ``right_labels`` the first that fits is used.
     """
@@ -115,11 +94,10 @@ class FlightMap(NamedTuple):
     tracks: Mapping[str, Coordinates]
     right_labels: Sequence[str]
     up_label: str
-    to_map: Callable[[Any, Any], Coordinates]
 
     @property
     def is_long(self) -> bool:
-        """True if the track is so long and narrow that the panels fill the page width."""
+        """True if the track is so long and narrow that the plots fill the page width."""
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
@@ -133,70 +111,58 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     analysis : Analysis
     card : Card
     free_height : float
-        Height (pt) that is left on the page.
+        Height (points) that is left on the page.
     """
     page = Page()
     block["blocks"] = page.blocks
-    legend = page.legend(_legend_entries(analysis))
-    errors, innovations = _error_strips(analysis, card), _innovation_strip(analysis.main)
+    legend = add_legend(page, analysis)
+    errors, innovations = _error_plots(analysis, card), _innovation_plot(analysis.main)
     flight_map = _flight_map(analysis, card)
-    rest = free_height - legend["height"] - LEGEND_GAP - SPARE_HEIGHT
-    if rest < MIN_THIRDS_HEIGHT:
-        rest = NEXT_PAGE_HEIGHT
+    height = free_height - legend["height"] - UNUSED_HEIGHT
+    if height < MIN_HEIGHT:
+        height = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
-    least = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
-    innovation_height = float(np.clip(INNOVATION_SHARE * rest, *INNOVATION_HEIGHTS))
-    if flight_map.is_long and rest >= least:
-        map_height = float(np.clip(MAP_SHARE * rest, *MAP_HEIGHTS))
+    min_height = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
+    innovation_height = float(np.clip(INNOVATION_FRACTION * height, *INNOVATION_HEIGHTS))
+    if flight_map.is_long and height >= min_height:
+        map_height = float(np.clip(MAP_FRACTION * height, *MAP_HEIGHTS))
         _draw_map(page, analysis, flight_map, map_height)
-        heights = _equal_heights(
-            page, errors, rest - map_height - innovation_height, is_labelled=False
-        )
-        _draw_strips(page, analysis, [*errors, innovations], [*heights, innovation_height])
+        error_heights = _equal_heights(page, errors, height - map_height - innovation_height)
+        _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
         return
-    columns = list(halves())
-    left_strips = [innovations] if errors else []
-    if errors and rest < MIN_HALVES_HEIGHT:
-        columns = [Page(width=(PAGE_WIDTH - 2.0 * COLUMN_GAP) / 3.0) for _ in range(3)]
-        _draw_strips(columns[2], analysis, left_strips, [rest])
-        left_strips = []
-    heights = [innovation_height] * len(left_strips)
-    _draw_map(columns[0], analysis, flight_map, rest - sum(heights))
-    _draw_strips(columns[0], analysis, left_strips, heights)
-    strips = errors or [innovations]
-    heights = _equal_heights(columns[1], strips, rest, is_labelled=True)
-    _draw_strips(columns[1], analysis, strips, heights)
+    columns, map_height = halves(), height
+    if not errors:
+        errors = [innovations]
+    elif height >= MIN_INNOVATIONS_HEIGHT:
+        map_height -= innovation_height
+    _draw_map(columns[0], analysis, flight_map, map_height)
+    if map_height < height:
+        _draw_plots(columns[0], analysis, [innovations], [innovation_height])
+    label_height = HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
+    heights = _equal_heights(columns[1], errors, height - label_height)
+    heights[-1] += label_height
+    _draw_plots(columns[1], analysis, errors, heights)
     page.add_columns(*columns, above=0.0)
 
 
-def _draw_strips(
-    page: Page, analysis: Analysis, strips: Sequence[Strip], heights: Sequence[float]
+def _draw_plots(
+    page: Page, analysis: Analysis, plots: Sequence[TimePlot], heights: Sequence[float]
 ) -> None:
-    """Draw plots on one time axis; their heights (pt) include titles and labels."""
-    for strip, height in zip(strips, heights, strict=True):
-        is_last = strip is strips[-1]
-        axes_height = height - _head_height(page, strip.title) - HEIGHT_BELOW_AXES[is_last]
-        axes = page.panel(
-            strip.title, "", axes_height, above=4.0, left=LEFT_MARGIN, is_compact=True
-        )
-        shown = analysis.segment.flight
-        axes.set_xlim(shown.start_s, shown.end_s)
+    """Draw plots on one time axis; their heights (points) include titles and labels."""
+    for plot, height in zip(plots, heights, strict=True):
+        is_last = plot is plots[-1]
+        axes_height = height - _head_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
+        axes = page.panel(plot.title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
+        event_marks.draw_marks(axes, analysis)
         axes.locator_params(axis="x", nbins=_tick_count(page))
-        strip.draw(axes)
+        plot.draw(axes)
         style.label_time_axis(axes, is_last)
 
 
-def _equal_heights(
-    page: Page, strips: Sequence[Strip], total: float, *, is_labelled: bool
-) -> list[float]:
-    """Return heights (pt) of plots with equal axes that add up to a total.
-
-    If ``is_labelled``, the last strip has the labels of the time axis.
-    """
-    extras = [_head_height(page, strip.title) + HEIGHT_BELOW_AXES[False] for strip in strips]
-    if is_labelled:
-        extras[-1] += HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
-    axes_height = (total - sum(extras)) / max(len(strips), 1)
+def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[float]:
+    """Return heights (points) of plots that add up to a total, for axes of equal height."""
+    extras = [_head_height(page, plot.title) for plot in plots]
+    axes_height = (total - sum(extras)) / max(len(plots), 1)
     return [axes_height + extra_height for extra_height in extras]
 
 
@@ -208,7 +174,7 @@ def _head_height(page: Page, title: str) -> float:
     return TITLE_HEIGHT + TITLE_LINE * (line_count(title, page.width) - 1)
 
 
-def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
+def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
@@ -221,8 +187,7 @@ def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
         half_height = 1.1 * max(map(_shown_height, errors_by_filter.values()))
         rmse_m = effect.position_rmse_m if effect else {}
         return [
-            _error_strip(
-                analysis,
+            _error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
                 _format_size("RMSE", rmse_m.get(filter_name)),
                 errors["error_m"],
@@ -245,47 +210,40 @@ def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     widest = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
     half_height = 1.1 * max(float(difference.abs().max()), *widest)
     size = _format_size("RMS", effect.difference_rms_m if effect else None)
-    return [_error_strip(analysis, "KF − EKF2 (m)", size, difference, sigmas, half_height)]
+    return [_error_plot("KF − EKF2 (m)", size, difference, sigmas, half_height)]
 
 
 def _format_size(label: str, length_m: float | None) -> list[str]:
     return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
 
 
-def _error_strip(
-    analysis: Analysis,
+def _error_plot(
     label: str,
     sizes: list[str],
     curve: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_height: float,
-) -> Strip:
+) -> TimePlot:
     """Return the plot of a position error or of KF - EKF2 (m), with ±2σ of each filter."""
-    texts = [f"{name} {text}" for name, sigma in sigmas.items() if (text := _format_sigma(sigma))]
-    if len(sigmas) == 1:
-        texts = [text.partition(" ")[2] for text in texts]
+    known_sigmas = {
+        name: known for name, sigma in sigmas.items() if not (known := sigma.dropna()).empty
+    }
+    texts = [
+        f"{name} {_format_sigma(sigma)}" if len(sigmas) > 1 else _format_sigma(sigma)
+        for name, sigma in known_sigmas.items()
+    ]
     if texts:
         sizes = [*sizes, f"σ {', '.join(texts)}"]
-    largest_value = float(curve.abs().max())
-    if largest_value < FLAT_SHARE * half_height:
-        sizes = [*sizes, f"at most {format_metres(largest_value)}, flat on this scale"]
     line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_height, half_height)
-        for name, sigma in sigmas.items():
-            _draw_sigma(axes, sigma, name)
+        for name, sigma in known_sigmas.items():
+            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.BANDS[name])
         axes.axhline(0.0, color="black", lw=0.5)
         draw_curve(axes, curve, **line)
-        _draw_spans(axes, analysis)
-        if "EKF2" in sigmas:
-            for time_s in horizontal_resets(analysis):
-                axes.axvline(time_s, **RESET_LINE)
-            _draw_at_edge(axes, _rejection_times(analysis), 0.06, REJECTED_MARK)
-        else:
-            _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
 
-    return Strip(f"{label}: {', '.join(sizes)}", draw)
+    return TimePlot(f"{label}: {', '.join(sizes)}", draw)
 
 
 def _shown_height(errors: pd.DataFrame) -> float:
@@ -297,90 +255,23 @@ def _shown_height(errors: pd.DataFrame) -> float:
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    valid_sigma = _settled_sigma(sigma)
-    if valid_sigma.empty:
-        return ""
-    low, high = float(valid_sigma.min()), float(valid_sigma.max())
-    if high < MAX_SIGMA_SPREAD * low:
-        return format_metres(float(valid_sigma.median()))
+    """Format the range of σ (m) after :data:`SETTLING_S`, or its median if it hardly changes."""
+    settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SETTLING_S, sigma.index[-1])]
+    low, high = float(settled_sigma.min()), float(settled_sigma.max())
+    if high < MAX_SIGMA_RATIO * low:
+        return format_metres(float(settled_sigma.median()))
     return f"{format_metres(low)} to {format_metres(high)}"
 
 
-def _settled_sigma(sigma: pd.Series[float]) -> pd.Series[float]:
-    """Return the known σ of a filter from :data:`SETTLING_S` after its start on."""
-    valid_sigma = sigma.dropna()
-    settled: pd.Series[float] = valid_sigma[
-        valid_sigma.index >= valid_sigma.index.min() + SETTLING_S
-    ]
-    return settled
-
-
-def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
-    """Draw ±2σ of a filter; beyond the plot, draw triangles and write the largest value."""
-    valid_sigma = sigma.dropna()
-    if valid_sigma.empty:
-        return
-    style.draw_sigma_band(axes, 0.0 * valid_sigma, valid_sigma, style.BANDS[name])
-    valid_sigma = _settled_sigma(sigma)
-    top = axes.get_ylim()[1]
-    if valid_sigma.empty or (largest_2_sigma := 2.0 * float(valid_sigma.max())) <= top:
-        return
-    largest_sigma_s = float(valid_sigma.index[int(np.argmax(valid_sigma))])
-    for sign, marker in ((1.0, "^"), (-1.0, "v")):
-        axes.plot(largest_sigma_s, sign * top, marker, color="black", ms=4.5, mew=0, clip_on=False)
-    low, high = axes.get_xlim()
-    is_right = largest_sigma_s > 0.5 * (low + high)
-    axes.annotate(
-        f"±2σ of {name} up to ±{format_metres(largest_2_sigma)} m",
-        (largest_sigma_s, -top),
-        xytext=(-6.0 if is_right else 6.0, 3.0),
-        textcoords="offset points",
-        ha="right" if is_right else "left",
-        va="bottom",
-        size=8.0,
-        bbox={"facecolor": "white", "alpha": 0.8, "lw": 0.0, "pad": 1.0},
-    )
-
-
-def _draw_spans(axes: Axes, analysis: Analysis) -> None:
-    for spans, band in (
-        (analysis.events.gaps, GAP_HATCH),
-        (analysis.events.dropouts, DROPOUT_BAND),
-    ):
-        for start, end in spans:
-            axes.axvspan(start, end, **band, zorder=1.5)
-
-
-def _rejection_times(analysis: Analysis) -> Array:
-    return np.asarray(analysis.events.rejected_s.get(analysis.main.axis.name, ()), np.float64)
-
-
-def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
-    if len(times):
-        visible_times_s = _thinned_times(axes, times)
-        axes.plot(
-            visible_times_s,
-            np.full(len(visible_times_s), height),
-            transform=axes.get_xaxis_transform(),
-            **mark,
-        )
-
-
-def _thinned_times(axes: Axes, times: Array) -> Array:
-    low, high = axes.get_xlim()
-    return visible_times(times, MIN_MARK_DISTANCE * (high - low))
-
-
-def _innovation_strip(result: AxisComparison) -> Strip:
+def _innovation_plot(result: AxisComparison) -> TimePlot:
     """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
     series = normalised_innovations(result)
-    sizes = {name: float(values.abs().max()) for name, values in series.items() if len(values)}
-    marks = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●□", strict=False))
-    title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
-    if (largest_size := max(sizes.values(), default=0.0)) < FLAT_INNOVATIONS:
-        title += f"; all are inside ±{format_ratio(largest_size)}"
+    symbols = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
+    title = f"Innovations ÷ √S ({symbols}): 95 % belong inside ±2"
     beyond = [
-        f"{name} {format_ratio(size)}" for name, size in sizes.items() if size > MAX_NORMALISED
+        f"{name} {format_ratio(size)}"
+        for name, values in series.items()
+        if (size := float(values.abs().max())) > MAX_NORMALISED
     ]
     if beyond:
         title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
@@ -389,21 +280,12 @@ def _innovation_strip(result: AxisComparison) -> Strip:
         axes.set_ylim(-1.12 * MAX_NORMALISED, 1.12 * MAX_NORMALISED)
         height = axes.bbox.height * 72.0 / axes.figure.dpi
         axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_TICKS_HEIGHT else 4.0))
-        axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.5)
+        axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         axes.axhline(0.0, color="black", lw=0.5)
         for name in reversed(series):
-            values, dots = series[name], INNOVATION_DOTS[name]
-            values_in_scale = values[values.abs() <= MAX_NORMALISED]
-            axes.plot(values_in_scale.iloc[:: -(-len(values) // MAX_DRAWN_INNOVATIONS)], **dots)
-            for sign, marker in ((1.0, "^"), (-1.0, "v")):
-                times = values.index[sign * values > MAX_NORMALISED].to_numpy()
-                edge = {**dots, "marker": marker, "ms": 3.4, "mew": 0, "mfc": dots["color"]}
-                visible_times_s = _thinned_times(axes, times)
-                axes.plot(
-                    visible_times_s, np.full(len(visible_times_s), sign * MAX_NORMALISED), **edge
-                )
+            draw_dots(axes, series[name], MAX_NORMALISED, style.DOTS[name])
 
-    return Strip(title, draw)
+    return TimePlot(title, draw)
 
 
 def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
@@ -439,70 +321,59 @@ def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
         name = analysis.source.name
         right_labels, up_label = [f"y of {name} (m)", "y (m)"], f"x of {name} (m)"
     c, s = np.cos(heading), np.sin(heading)
-
-    def to_map(north: Any, east: Any) -> Coordinates:
-        return c * north + s * east, s * north - c * east
-
-    tracks = {name: to_map(*track) for name, track in _map_tracks(analysis).items()}
-    return FlightMap(tracks, right_labels, up_label, to_map)
+    tracks = {
+        name: (c * north + s * east, s * north - c * east)
+        for name, (north, east) in _map_tracks(analysis).items()
+    }
+    return FlightMap(tracks, right_labels, up_label)
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
-    """Draw the tracks at equal scales, with triangles where a track leaves the map."""
+    """Draw the tracks at equal scales; the title names the tracks that leave the map."""
     tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT
     title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
     limits = _map_limits(tracks, width / axes_height)
-    if leaving := _leaving_tracks(tracks, limits):
-        title = f"Map; tracks leave it at the triangles ({leaving})"
+    distances_m = {
+        name: np.nanmax(np.abs(track - np.clip(track, *limits)))
+        for name, track in ((name, np.transpose(track)) for name, track in tracks.items())
+    }
+    outside = [f"{name} {format_metres(d)} m" for name, d in distances_m.items() if d > 0.0]
+    if outside:
+        title = f"Map; tracks leave it by up to: {', '.join(outside)}"
         axes_height = height - _head_height(page, title) - HEIGHT_BELOW_AXES[True]
         limits = _map_limits(tracks, width / axes_height)
-    axes = page.panel(title, "", axes_height, above=4.0, left=LEFT_MARGIN, is_compact=True)
+    axes = page.panel(title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
     right_label = next(
         text for text in flight_map.right_labels if text_width(text) < page.width - LEFT_MARGIN
     )
-    axes.set(xlim=limits[0], ylim=limits[1], xlabel=right_label, ylabel=flight_map.up_label)
+    (left, bottom), (right, top) = limits
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
     axes.locator_params(axis="x", nbins=_tick_count(page))
     axes.grid(True, axis="both")
-    for name, (right, up) in tracks.items():
+    for name, (right_m, up_m) in tracks.items():
         if name == "positions":
-            axes.plot(right, up, **style.MEASUREMENT_DOTS | {"ms": 2.4})
+            axes.plot(right_m, up_m, **style.MEASUREMENT_DOTS | {"ms": 2.4})
         else:
-            stride = max(1, len(right) // style.MAX_POINTS)
-            axes.plot(right[::stride], up[::stride], **LINES[name])
-        for marker, (x, y) in _map_exits((right, up), limits):
-            axes.plot(x, y, marker, color=_track_colour(name), ms=5.0, mew=0, clip_on=False)
-    samples = analysis.source.samples
+            stride = max(1, len(right_m) // style.MAX_POINTS)
+            axes.plot(right_m[::stride], up_m[::stride], **LINES[name])
+    position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
+    right_m, up_m = tracks["positions"]
     for times, mark in (
-        (analysis.events.take_off_s, TAKE_OFF_MARK),
-        (analysis.events.landing_s, LANDING_MARK),
+        (analysis.events.take_off_s, event_marks.TAKE_OFF_MARK),
+        (analysis.events.landing_s, event_marks.LANDING_MARK),
     ):
-        if times:
-            nearest_samples = samples.iloc[
-                samples.index.get_indexer(pd.Index(times), method="nearest")
-            ]
-            place = flight_map.to_map(nearest_samples["north_m"], nearest_samples["east_m"])
-            axes.plot(*place, **{**mark, "ms": 9.0, "mec": "white", "mew": 0.8, "zorder": 3.0})
+        nearest = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
+        axes.plot(right_m[nearest], up_m[nearest], **mark | {"ms": 9.0, "mec": "white", "mew": 0.8})
 
 
-def _leaving_tracks(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
-    sizes = {name: _distance_outside(track, limits) for name, track in tracks.items()}
-    return ", ".join(
-        f"{name} {format_metres(size)} m" for name, size in sizes.items() if size > 0.0
-    )
+def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> tuple[Array, Array]:
+    """Return the lower left and the upper right corner of the map (m).
 
-
-def _track_colour(name: str) -> str:
-    return style.MEASUREMENT_COLOUR if name == "positions" else str(LINES[name]["color"])
-
-
-def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
-    """Return the limits of both map axes at equal scales.
-
-    They show all ground truth and 98 % of the positions, and the other tracks up to
-    :data:`MAP_REACH` outside of these; a filter with a large error does not shrink the flight.
+    The map shows all ground truth and 98 % of the positions, and the other tracks up to
+    :data:`MAP_REACH` outside of these, so a filter with a large error does not shrink the flight.
     """
-    spans = []
+    middles, sizes = [], []
     for side in (0, 1):
         ends = [np.percentile(tracks["positions"][side], (1.0, 99.0))]
         if "ground truth" in tracks:
@@ -510,79 +381,12 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
         reach = MAP_REACH * (np.max(ends) - np.min(ends))
         limits = np.min(ends) - reach, np.max(ends) + reach
         ends += [np.clip(_range_of(track[side]), *limits) for track in tracks.values()]
-        low, high = np.min(ends), np.max(ends)
-        spans.append((0.5 * (low + high), max(MAP_MARGIN * (high - low), MIN_MAP_LENGTH_M)))
-    (x, length), (y, breadth) = spans
-    length = max(length, breadth * ratio)
-    breadth = length / ratio
-    return (
-        (float(x - 0.5 * length), float(x + 0.5 * length)),
-        (float(y - 0.5 * breadth), float(y + 0.5 * breadth)),
-    )
+        middles.append(0.5 * (np.min(ends) + np.max(ends)))
+        sizes.append(max(MAP_MARGIN * (np.max(ends) - np.min(ends)), MIN_MAP_LENGTH_M))
+    length = max(sizes[0], sizes[1] * ratio)
+    half_size = 0.5 * np.array([length, length / ratio])
+    return np.array(middles) - half_size, np.array(middles) + half_size
 
 
 def _range_of(values: Array) -> Array:
     return np.array([np.nanmin(values), np.nanmax(values)])
-
-
-def _overshoot(values: Array, limits: tuple[float, float]) -> Array:
-    """Return the signed distance of values beyond two limits; 0 between them."""
-    return np.asarray(values - np.clip(values, *limits))
-
-
-def _distance_outside(track: Coordinates, limits: MapLimits) -> float:
-    return max(
-        float(np.nanmax(np.abs(_overshoot(values, ends))))
-        for values, ends in zip(track, limits, strict=True)
-    )
-
-
-def _map_exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield a triangle and its place on the frame where a track leaves or enters the map."""
-    over = [_overshoot(values, ends) for values, ends in zip(track, limits, strict=True)]
-    is_outside = (over[0] != 0.0) | (over[1] != 0.0)
-    changes = np.flatnonzero(np.diff(is_outside, prepend=False, append=False))
-    spacing = MIN_EXIT_DISTANCE * (limits[0][1] - limits[0][0])
-    last = np.full(2, np.inf)
-    for change in changes:
-        # use the sample outside of the map next to the crossing of its frame
-        index = change if change < len(is_outside) and is_outside[change] else change - 1
-        x, y = over[0][index], over[1][index]
-        marker = ("^" if y > 0.0 else "v") if abs(y) >= abs(x) else (">" if x > 0.0 else "<")
-        place = np.array([np.clip(track[side][index], *limits[side]) for side in (0, 1)])
-        if np.abs(place - last).max() >= spacing:
-            yield marker, (float(place[0]), float(place[1]))
-            last = place
-
-
-def _legend_entries(analysis: Analysis) -> list[Artist]:
-    from matplotlib.lines import Line2D  # noqa: PLC0415
-    from matplotlib.patches import Patch  # noqa: PLC0415
-
-    names = _map_tracks(analysis).keys()
-    entries: list[Artist] = [
-        Line2D([], [], **line, label=name) for name, line in LINES.items() if name in names
-    ]
-    events = analysis.events
-    marks: Sequence[tuple[str, Any, dict[str, Any]]] = (
-        ("positions", names, {**style.MEASUREMENT_DOTS, "ms": 5.0}),
-        ("take-off", events.take_off_s, TAKE_OFF_MARK),
-        ("landing", events.landing_s, LANDING_MARK),
-        ("outlier", outlier_times(analysis), OUTLIER_MARK),
-        ("EKF2 rejected", _rejection_times(analysis), REJECTED_MARK),
-        ("EKF2 reset", horizontal_resets(analysis), RESET_LINE),
-    )
-    entries += [
-        Line2D([], [], **mark, label=label)
-        for label, marked_values, mark in marks
-        if len(marked_values)
-    ]
-    bands: Sequence[tuple[str, Any, dict[str, Any]]] = (
-        ("±2σ reported", names, {"facecolor": "#c9c9c9", "lw": 0.0}),
-        ("gap", events.gaps, GAP_HATCH),
-        ("log dropout", events.dropouts, DROPOUT_BAND),
-    )
-    entries += [
-        Patch(**band, label=label) for label, marked_values, band in bands if len(marked_values)
-    ]
-    return entries

@@ -1,4 +1,4 @@
-"""Page on the difference KF - EKF2, divided into the changes that turn KF into the logged EKF2."""
+"""Page on the difference KF - EKF2: replace KF's settings by EKF2's, one at a time."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -27,15 +27,17 @@ from px4fuse.report.style import (
     draw_curve,
 )
 
-TITLE = "Difference between KF and EKF2, step by step"
-ROW_HEIGHT, LABEL_WIDTH = 12.0, 140.0  # height of a bar and width of its label (points)
+TITLE = "Difference between KF and EKF2, setting by setting"
+ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
+LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
 TIME_HEIGHT = 105.0  # height (points) of the axes of the difference over time
-INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase KF - EKF2
+# Style of the bar of a replacement that increases KF - EKF2
+INCREASE_STYLE = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the steps that turn KF into EKF2; no page without an explanation of the difference."""
+    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if they are unknown."""
     explanations = _axis_explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
@@ -44,14 +46,14 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(
         TITLE,
         (
-            "A series of replays changes KF into the logged EKF2, one step at a time (with "
-            "px4fuse's model of EKF2). Each bar is the reduction of the mean square "
-            "difference by that step; a hatched bar is an increase. The bars add up to 100 %."
+            "KF is replayed with its settings and equations replaced by those of EKF2, one at "
+            "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
+            "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %."
         ),
     )
     for name, explanation in explanations.items():
         if isinstance(explanation, Unavailable):
-            page.heading(f"{name}: no result", 9.5, above=10.0)
+            page.heading(f"{name}: no result")
             page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
         else:
             _draw_axis(page, name, explanation, analysis)
@@ -65,13 +67,13 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation of KF - EKF2 along the main axis, else those of all axes."""
+    """Return the explanation of KF - EKF2 along the main axis; without a main axis, of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the largest contribution to KF - EKF2, or the reason why it is unknown."""
+    """Write the largest contribution to KF - EKF2, or the reason for a missing explanation."""
     if isinstance(explanation, Unavailable):
         page.write_labelled(
             "KF-EKF2", f"The difference KF - EKF2 is not explained: {explanation.reason}."
@@ -81,7 +83,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 
 def unexplained_note(analysis: Analysis) -> str:
-    """Return why the report does not explain KF - EKF2; "" if it does or the log has no EKF2."""
+    """Return the reason for a missing explanation of KF - EKF2; "" if nothing is missing."""
     explanations = list(_axis_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations
@@ -96,7 +98,7 @@ def unexplained_note(analysis: Analysis) -> str:
 
 
 def format_agreement(agreement: Agreement) -> str:
-    """Format the agreement of the EKF2 replay with the log: statistics and verdict."""
+    """Format the agreement of the EKF2 replay with the log."""
     axes = agreement.axes.items()
     correlation = ", ".join(f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes)
     ratio = ", ".join(
@@ -119,7 +121,7 @@ def _draw_axis(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
-    page.heading(f"{name}, {spans}", 9.5, above=10.0)
+    page.heading(f"{name}, {spans}")
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]
@@ -143,7 +145,7 @@ def _draw_axis(
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained_mean_square / total)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
+    title = "Position difference KF - EKF2 (m, dark) and unexplained rest (light)"
     axes = event_marks.panel(
         page,
         analysis,
@@ -163,7 +165,7 @@ def _draw_axis(
 
 
 def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_share: float) -> None:
-    """Draw bars from the mean square of KF - EKF2 down to its unexplained rest (% of the total)."""
+    """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
     rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}

@@ -1,46 +1,42 @@
 """Page on trajectory errors: map coloured by error, APE and RPE (the names of the tool evo)."""
 
 from collections.abc import Iterator, Mapping
-from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import PAGE_WIDTH, Page, halves
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
+from px4fuse.report.page import Page, halves
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
-# Indices of the coordinates drawn to the right, drawn upwards, and vertical; True if that is down
-PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
-    "NED": (1, 0, 2, True),
-    "FRD": (1, 0, 2, True),
-    "ENU": (0, 1, 2, False),
-    "camera": (0, 2, 1, True),
-    "unknown": (0, 1, 2, False),
+# Indices of the axes that the map shows to the right and upwards
+MAP_AXES: Mapping[Frame, tuple[int, int]] = {
+    "NED": (1, 0),
+    "FRD": (1, 0),
+    "ENU": (0, 1),
+    "camera": (0, 2),
+    "unknown": (0, 1),
 }
-# Maximum height / length of a path whose page has no side view
-MAX_FLAT_RATIO = 0.1
-# Minimum time between two poses, in median times, at which the drawn path is interrupted
+# Minimum time between two poses for a gap in the drawn path, in median times between poses
 MIN_GAP_STEPS = 10.0
-MAX_PATH_POINTS = 1200
-MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
-PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # heights and gap (points)
-MAX_DELTA_LABELS = 12
+MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
+MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
+PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
+MAP_HEIGHT = 128.0  # height (points) of the axes of a map
+MAX_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
-    ("mean", "mean", style.line_style("black", 0.9, (0, (5, 2)))),
-    ("median", "median", style.line_style("black", 0.9, (0, (5, 1.5, 1, 1.5)))),
 )
-NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
-SHADES_CAPTION = "Darker poses have a larger error; × marks the largest one."
+NEGLIGIBLE_ERROR_M = 1e-6  # maximum error (m) by rounding
 ERROR_TABLE_HEAD = (
     "error",
     "RMSE",
@@ -52,51 +48,6 @@ ERROR_TABLE_HEAD = (
     "n",
     "rotation\nRMSE (°)",
 )
-
-
-@cache
-def error_colours() -> Colormap:
-    """Return a colour map from light to dark that stays readable in grey and on white."""
-    import matplotlib as mpl  # noqa: PLC0415
-    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
-
-    rgba = mpl.colormaps["YlOrRd"](np.linspace(0.3, 1.0, 128)) * (1.0, 1.0, 1.0, 1.0)
-    rgba[:, :3] *= np.linspace(1.0, 0.55, 128)[:, np.newaxis]
-    return LinearSegmentedColormap.from_list("error", rgba)
-
-
-class View(NamedTuple):
-    """View of a path: indices and names of the coordinates drawn to the right and upwards."""
-
-    across: int
-    up: int
-    is_down: bool
-    names: tuple[str, str]
-
-    def project(self, position_m: Array) -> Array:
-        """Project positions, shape (n, 3), to page coordinates, shape (n, 2)."""
-        return np.asarray(position_m[:, (self.across, self.up)])
-
-
-def path_views(evaluation: Evaluation) -> list[View]:
-    """Return the view from above, and the side view if the path is not flat."""
-    across, up, vertical_axis, is_down = PAGE_AXES[evaluation.reference.frame]
-    names = AXES_OF_FRAME[evaluation.reference.frame]
-    extent = np.maximum(
-        np.ptp(evaluation.reference_m, axis=0), np.ptp(evaluation.estimate_m, axis=0)
-    )
-    horizontal_axis = across if extent[across] >= extent[up] else up
-    all_views = [
-        View(across, up, False, (names[across], names[up])),
-        View(
-            horizontal_axis, vertical_axis, is_down, (names[horizontal_axis], names[vertical_axis])
-        ),
-    ]
-    return (
-        all_views
-        if extent[vertical_axis] > MAX_FLAT_RATIO * extent[horizontal_axis]
-        else all_views[:1]
-    )
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -116,72 +67,53 @@ def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
 
 
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
-    """Draw both paths before alignment, and in each view the aligned path coloured by error."""
-    map_views, is_aligned = path_views(evaluation), evaluation.alignment != "none"
-    count = len(map_views) + is_aligned
-    width = (PAGE_WIDTH - MAP_GAP * (count - 1)) / count
+    """Draw both paths from above before the alignment, and the aligned path coloured by error."""
+    frame, is_aligned = evaluation.reference.frame, evaluation.alignment != "none"
+    map_axes = list(MAP_AXES[frame])
+    right, up = (AXES_OF_FRAME[frame][index] for index in map_axes)
     columns, estimate_handle = [], []
     if is_aligned:
-        columns.append(Page(width=width))
+        columns.append(halves()[0])
         axes = columns[-1].panel("Before alignment", "", MAP_HEIGHT, left=34.0)
-        for position, line_style, label in (
+        for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            plot_path(
-                axes, map_views[0].project(position), evaluation.time_s, label=label, **line_style
-            )
-        _set_map_frame(axes, map_views[0])
+            plot_path(axes, position_m[:, map_axes], evaluation.time_s, label=label, **line_style)
+        style.set_map_axes(axes, right, up)
         estimate_handle = axes.get_legend_handles_labels()[0][1:]
         columns[-1].write_small(unaligned_sentence(evaluation))
-    for view in map_views:
-        columns.append(Page(width=width))
-        title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-        axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
-        draw_path(axes, evaluation, view)
-        columns[-1].write_small(
-            SHADES_CAPTION if view is map_views[0] else vertical_error_sentence(evaluation, view.up)
-        )
+    columns.append(halves()[1])
+    title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
+    axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
+    _draw_path(axes, evaluation, map_axes)
+    style.set_map_axes(axes, right, up)
+    columns[-1].write_small("Darker poses have a larger error; × marks the largest one.")
     page.legend([*axes.get_legend_handles_labels()[0], *estimate_handle])
-    page.add_columns(*columns, gap=MAP_GAP)
+    page.add_columns(*columns)
 
 
-def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:
-    """Draw the aligned path coloured by error, with the reference dashed."""
-    error, path = evaluation.position_error_m, view.project(evaluation.estimate_m)
+def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
+    error, path = evaluation.position_error_m, evaluation.estimate_m[:, map_axes]
     stride = max(1, len(error) // MAX_PATH_POINTS)
-    scatter_points = axes.scatter(
+    dots = axes.scatter(
         path[::stride, 0],
         path[::stride, 1],
         c=error[::stride],
         s=9.0,
-        cmap=error_colours(),
+        cmap="copper_r",  # from light to dark, readable in grey and on white
         linewidths=0,
         vmin=0.0,
         vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
     )
-    plot_path(
-        axes,
-        view.project(evaluation.reference_m),
-        evaluation.time_s,
-        label="reference",
-        **REFERENCE_LINE,
-    )
+    reference_m = evaluation.reference_m[:, map_axes]
+    plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE)
     axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path[np.argmax(error)]
     axes.plot(*worst_point, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
-    _set_map_frame(axes, view)
-    bar = axes.figure.colorbar(scatter_points, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    bar = axes.figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
     bar.set_label("APE (m)", labelpad=1)
     bar.outline.set_linewidth(0.5)
-
-
-def _set_map_frame(axes: Axes, view: View) -> None:
-    style.set_map_axes(axes, *view.names)
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=6)
-    if view.is_down:
-        axes.invert_yaxis()
 
 
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
@@ -189,7 +121,6 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, *time_from_start(evaluation))
     page.legend(axes.get_legend_handles_labels()[0])
-    left.write_small(worst_poses_sentence(evaluation))
     axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     right.write_small(quarters_sentence(evaluation))
@@ -202,7 +133,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
-    """Draw the APE with its RMSE, mean, median and maximum as horizontal lines."""
+    """Draw the APE with its RMSE and maximum as horizontal lines."""
     error, low, high = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
     shown_along, values = style.decimate_series(x_values, error, style.MAX_POINTS_NARROW)
     gap_indices = np.searchsorted(shown_along, x_values[_gap_indices(evaluation.time_s)])
@@ -214,7 +145,7 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
     )
     for name, title, line_style in STATISTIC_LINES:
         value = getattr(evaluation.ate.translation_m, name)
-        axes.axhline(value, label=f"{title} {format_metres(value)}", zorder=3, **line_style)
+        axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
     axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
     axes.set_ylim(0.0, 1.08 * max(float(error.max()), MIN_ERROR_RANGE_M))
     axes.locator_params(axis="x", nbins=6)
@@ -239,7 +170,7 @@ def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statist
 
 
 def time_from_start(evaluation: Evaluation) -> tuple[Array, str]:
-    """Return the time of each pose since the origin of the time axis (s), and the axis label."""
+    """Return the time of each pose (s) on the time axis, and the label of the axis."""
     origin_s = time_origin_s(evaluation)
     return evaluation.time_s - origin_s, "time from the first pose (s)" if origin_s else "time (s)"
 
@@ -250,7 +181,7 @@ def _gap_indices(time_s: Array) -> IntArray:
 
 
 def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None:
-    """Draw a path, shape (n, 2), reduced to MAX_PATH_POINTS and interrupted at gaps in time."""
+    """Draw a path, shape (n, 2), with gaps where the time has gaps."""
     gaps = _gap_indices(time_s)
     evenly_spaced = np.linspace(0, len(positions) - 1, min(len(positions), MAX_PATH_POINTS)).astype(
         np.intp
@@ -261,17 +192,8 @@ def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None
     )
 
 
-def format_metres(value: float) -> str:
-    """Format a length with three decimals, one from 10 m on.
-
-    >>> format_metres(0.0512), format_metres(31.26)
-    ('0.051 m', '31.3 m')
-    """
-    return f"{value:.3f} m" if abs(value) < 10.0 else f"{value:.1f} m"
-
-
 def time_origin_s(evaluation: Evaluation) -> float:
-    """Return the origin of the time axes: the first pose if timestamps are UNIX time, else 0 s."""
+    """Return the time (s) of the first pose if timestamps are UNIX time, else 0."""
     start = float(evaluation.time_s[0])
     return start if start > MIN_UNIX_TIME_S else 0.0
 
@@ -282,8 +204,8 @@ def summary(evaluation: Evaluation) -> str:
     preposition = "without" if evaluation.alignment == "none" else "after"
     error = evaluation.ate.translation_m
     return (
-        f"ATE {format_metres(error.rmse)} (RMSE {preposition} alignment). Largest error "
-        f"{format_metres(error.max)} at "
+        f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
+        f"{format_metres(error.max)} m at "
         f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after "
         f"{evaluation.distance_m[worst_index]:.1f} m of the path."
     )
@@ -305,7 +227,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return the table rows of the ATE and of each RPE, with the columns of ERROR_TABLE_HEAD."""
+    """Return the rows of the error table: ATE, then each RPE."""
     errors: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
@@ -323,7 +245,7 @@ def error_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def missing_reasons(evaluation: Evaluation) -> list[str]:
-    """Return a sentence with the reason for each missing quantity, without repetitions."""
+    """Return a sentence on each missing error statistic, without repetitions."""
     quantities = [
         evaluation.ate.interval_m,
         evaluation.ate.rotation_deg,
@@ -336,7 +258,7 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
 
 
 def unaligned_sentence(evaluation: Evaluation) -> str:
-    """Caption of the map before alignment: RMSE, and the transform of the alignment."""
+    """Return the caption of the map before alignment: RMSE and alignment transform."""
     estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
@@ -345,38 +267,14 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
         np.linalg.norm(alignment.apply(estimate_m.mean(axis=0)) - estimate_m.mean(axis=0))
     )
     return (
-        f"RMSE before alignment {format_metres(rmse_m)}. Alignment: rotation "
-        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)}"
+        f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
+        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
         f"{scale_text} (choice of frame, not an error)."
     )
 
 
-def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
-    """State the RMSE along the vertical axis and its fraction of the mean squared error."""
-    squares = ((evaluation.estimate_m - evaluation.reference_m) ** 2).mean(axis=0)
-    name = AXES_OF_FRAME[evaluation.reference.frame][axis]
-    if not squares.any():
-        return "Estimate and reference are equal: the RMSE is zero along every axis."
-    return (
-        f"Along {name} the RMSE is {format_metres(float(np.sqrt(squares[axis])))}: "
-        f"{squares[axis] / squares.sum():.0%} of the squared error."
-    )
-
-
-def worst_poses_sentence(evaluation: Evaluation) -> str:
-    """State the fraction of the squared error that the worst 10 % of the poses contribute."""
-    squared_errors = np.sort(evaluation.position_error_m**2)
-    worst_share = squared_errors[-max(1, len(squared_errors) // 10) :].sum() / max(
-        squared_errors.sum(), NEGLIGIBLE_ERROR_M**2
-    )
-    return (
-        f"The worst 10 % of the poses contribute {worst_share:.0%} of the squared error. "
-        "A constant error contributes 10 %; a few large errors contribute much more."
-    )
-
-
 def quarter_rmse(evaluation: Evaluation) -> list[float]:
-    """Return the RMSE (m) of each quarter of the reference path that contains poses."""
+    """Return the RMSE (m) of each quarter of the path that contains poses."""
     distance_m = evaluation.distance_m
     edges = np.linspace(0.0, distance_m[-1], 5)
     quarter_index = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, 3)
@@ -385,16 +283,16 @@ def quarter_rmse(evaluation: Evaluation) -> list[float]:
 
 
 def quarters_sentence(evaluation: Evaluation) -> str:
-    """Caption of the APE over distance: RMSE per quarter of the path."""
+    """Return the caption of the APE over distance: RMSE of each quarter of the path."""
     rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
     return (
-        f"RMSE per quarter of the path: {rmse_text} m. Drift grows along the path. After "
-        "alignment its error is large at both ends."
+        f"RMSE per quarter of the path: {rmse_text} m. An error by drift grows along the path; "
+        "after alignment it is large at both ends."
     )
 
 
 def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
-    """Caption of the RPE panel: growth of the RPE with delta, which separates noise from drift."""
+    """Return the caption of the RPE plot: growth of the RPE with the distance or time."""
     interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
@@ -430,7 +328,7 @@ def describe_track(path: Trajectory) -> str:
 
 
 def describe_method(evaluation: Evaluation) -> str:
-    """Format alignment, association and time offset of an evaluation on one line."""
+    """Format alignment, number of pose pairs and time offset of an evaluation."""
     association = evaluation.association
     offset = evaluation.time_offset.offset_s
     offset_text = "" if not offset else f"; time offset {offset:+.3f} s"

@@ -18,8 +18,7 @@ from px4fuse.report.style import (
     label_time_axis,
 )
 
-# Bands differ in shade and hatching, so they remain distinct in grey. Markers are at the bottom of
-# the axes, those of resets at the top
+# Bands differ in shade and hatching, so they remain distinct in grey
 _FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
 GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
     {"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8", "#f6f0e2")
@@ -27,17 +26,15 @@ GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
 GAP_BAND = _FILLED | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
 RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
 OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
-# Take-off and landing are no triangles, which mark values beyond the scale
 TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
-REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
 MODE_NAMES_HEIGHT = 12.0  # height (points) above the axes for the names of flight modes
-# Minimum time between two markers as a fraction of the segment; of closer ones one is drawn
+# Minimum time between two drawn markers, as a fraction of the segment
 MIN_MARK_DISTANCE = 1.0 / 300.0
-MODE_NAME_SIZE, MODE_LETTER_WIDTH = 8.0, 5.0  # type size and mean width of a letter (points)
+MODE_LETTER_WIDTH = 5.0  # mean width (points) of a letter of a flight mode's name
 
 
 class Mark(NamedTuple):
-    """Kind of event on a time axis: bands (height None), or markers at a height of 0 to 1."""
+    """Events of one type on a time axis: bands without `height`, else markers at 0 to 1."""
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -53,9 +50,9 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
         Mark("on the ground", events.ground, GROUND_BAND),
         Mark("gap in position source", events.gaps, GAP_BAND),
         Mark("log dropout", events.dropouts, DROPOUT_BAND),
-        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_HEIGHT),
-        Mark("outlier", outlier_times(analysis), OUTLIER_MARK, OUTLIER_HEIGHT),
-        Mark("EKF2 reset", events.resets_s, RESET_MARK, RESET_HEIGHT),
+        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, 0.025),
+        Mark("outlier", outlier_times(analysis), OUTLIER_MARK, 0.075),
+        Mark("EKF2 reset", events.resets_s, RESET_MARK, 0.92),
         Mark("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
         Mark("landing", events.landing_s, LANDING_MARK, 0.0),
     )
@@ -130,7 +127,7 @@ def panel(
 
 
 def outlier_times(analysis: Analysis) -> Array:
-    """Return the times (s) of the outliers that tuning found, horizontally or on the main axis."""
+    """Return the times (s) of the outliers found by noise estimation."""
     names = HORIZONTAL, analysis.main.axis.name
     times_by_axis = [
         axis_tuning.outlier_time_s
@@ -142,7 +139,7 @@ def outlier_times(analysis: Analysis) -> Array:
 
 
 def legend_entries(analysis: Analysis) -> list[Artist]:
-    """Return legend entries for the kinds of events in this flight."""
+    """Return a legend entry for each type of event in this flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -155,14 +152,14 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first time (s) in each interval, so that markers do not overlap."""
+    """Return the first time (s) of each interval, so that markers do not overlap."""
     values = np.asarray(times, dtype=np.float64)
     visible_s: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
     return visible_s
 
 
 def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
-    """Write the names of the flight modes above the axes if they fit."""
+    """Write the name of each flight mode above the axes if the mode is long enough."""
     low, high = axes.get_xlim()
     width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in analysis.events.modes:
@@ -175,6 +172,6 @@ def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
                 transform=axes.get_xaxis_transform(),
                 ha="center",
                 va="bottom",
-                size=MODE_NAME_SIZE,
+                size=8.0,
                 color=MUTED_COLOUR,
             )

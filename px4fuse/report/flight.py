@@ -1,7 +1,7 @@
 """Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time.
 
-The main axis has two pages, with a zoom into single predictions and updates; the other axes share
-one page.
+The main axis has two pages, with a plot of single predictions and updates. The other axes share one
+page.
 """
 
 from collections.abc import Iterator
@@ -13,22 +13,23 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.filter.signals import Segment
-from px4fuse.report import event_marks, panels, style
+from px4fuse.flight.model import Unavailable
+from px4fuse.report import panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, verdict_notes
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATES = 15
-MIN_ZOOM_S = 1.0
-ZOOM_HEIGHT = 125.0  # height (points) of the axes of the zoom
+ZOOM_UPDATES = 15  # number of updates in the plot of single predictions and updates
+MIN_ZOOM_S = 1.0  # minimum duration (s) of that plot
+ZOOM_HEIGHT = 125.0  # height (points) of its axes
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw position and velocity along the main axis over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
-    _write_legend(page, analysis)
+    panels.add_legend(page, analysis)
     panels.POSITION.draw_on_page(
         page, analysis, result, with_time_label=False, with_mode_names=True
     )
@@ -37,24 +38,8 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def _write_legend(page: Page, analysis: Analysis) -> None:
-    from matplotlib.lines import Line2D  # noqa: PLC0415
-    from matplotlib.patches import Patch  # noqa: PLC0415
-
-    result = analysis.main
-    lines: list[Artist] = [
-        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="measurement"),
-        Line2D([], [], **LINES["KF"], label="KF"),
-        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="KF ±2σ"),
-    ]
-    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
-        if isinstance(track, pd.DataFrame):
-            lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend([*lines, *event_marks.legend_entries(analysis)])
-
-
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw innovations, σ_p and σ_v along the main axis over time, with a zoom."""
+    """Draw innovations, σ_p and σ_v along the main axis over time, and σ_p over a few updates."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
@@ -69,7 +54,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
-    """Draw σ_p in each prediction and update during a short part of the flight."""
+    """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -85,17 +70,14 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
         lw=1.2,
     )
     axes.set_xlabel(style.TIME_LABEL)
-    symbols = []
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        symbols += ["triangle up before an update", "triangle down after it"]
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        symbols.append("square for the logged σ")
-    ekf2_legend = f" Symbols of EKF2: {', '.join(symbols)}." if symbols else ""
-    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
+    symbols = ""
+    if not isinstance(result.ekf2_state, Unavailable):
+        symbols = " EKF2: ▵ before and ▾ after an update, □ logged σ."
+    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{symbols}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the zoom, which contains about ZOOM_UPDATES updates.
+    """Return start and end (s) of the plot of a few updates.
 
     The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
     """
@@ -115,7 +97,7 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
-    # sort stably, so that the prior variance precedes the posterior at the time of an update
+    # a stable sort keeps the prior variance before the posterior variance of the same update
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
     axes.plot(variances.index, np.sqrt(variances), **dots)
@@ -134,7 +116,7 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """Return the caption of the zoom: σ_p before and after an update of KF and of EKF2."""
+    """Return the caption: σ_p of KF and EKF2 before and after an update."""
     texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
@@ -143,7 +125,9 @@ def zoom_sentence(result: AxisComparison) -> str:
         )
         if prior_m is None or posterior_m is None:
             if name == "EKF2":
-                texts.append("EKF2: S or R not logged, so σ before and after the update is unknown")
+                texts.append(
+                    "σ of EKF2 before and after the update is unknown, because S or R is not logged"
+                )
             continue
         reduction = 1.0 - posterior_m**2 / prior_m**2
         change_text = f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {reduction:.0%} less variance"
@@ -158,7 +142,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the axes except the main axis, one column each; no page without such axes."""
+    """Draw one column for each axis other than the main axis; no page without such an axis."""
     secondary_axes = analysis.secondary_axes
     if not secondary_axes:
         return

@@ -14,12 +14,12 @@ FONT = "DejaVu Sans"
 # Words in the names of fonts that draw a box for every character
 BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MAX_LISTED_CHARACTERS = 12  # maximum number of missing characters that the advice lists
+MAX_LISTED_CHARACTERS = 12  # maximum number of missing characters in the advice
 
 
 @cache
 def font_of(character: str) -> str | None:
-    """Return the font for a character: DejaVu Sans, else the first installed one, or None."""
+    """Return the name of a font with the character, if possible DejaVu Sans; else None."""
     if ord(character) in _characters(font_manager.findfont(FONT)):
         return FONT
     return next(
@@ -28,25 +28,25 @@ def font_of(character: str) -> str | None:
 
 
 def font_names(text: str) -> list[str]:
-    """Return the fonts needed for a text, DejaVu Sans first."""
+    """Return the names of the fonts for a text, DejaVu Sans first."""
     names = [font_of(character) for character in _non_ascii(text)]
     return list(dict.fromkeys([FONT, *(name for name in names if name is not None)]))
 
 
 def font_folders(names: tuple[str, ...]) -> list[str]:
-    """Return the folders of the files of the named fonts."""
+    """Return the folders with the files of the fonts."""
     paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
     font_files = [font_manager.findfont(FONT), *paths.values()]
     return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
 
 
 def missing_characters(text: str) -> str:
-    """Return the characters of a text that no installed font has, each once."""
+    """Return each character of a text for which no font is installed."""
     return "".join(character for character in _non_ascii(text) if font_of(character) is None)
 
 
 def font_advice(characters: str) -> str:
-    """Format the advice to install a font for missing characters."""
+    """Return the advice to install a font for missing characters."""
     listed_characters = characters[:MAX_LISTED_CHARACTERS] + (
         "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
     )

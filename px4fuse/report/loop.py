@@ -33,7 +33,7 @@ LEAD = (
 MAX_LISTED_CLOSURES = 10  # maximum number of rejected closures that the terminal lists
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED: style.EKF2_LINE,
+    corrections.UNCORRECTED: LINES["EKF2"],
     corrections.POSITIONS_ONLY: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
     corrections.BY_DISTANCE: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
     SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
@@ -57,7 +57,6 @@ CLOSURE_HEAD = (
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAX_MAP_POINTS = 2000  # maximum number of drawn points per path
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
@@ -82,7 +81,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
     _draw_map(page, loop)
-    page.heading("Closures and scores", 10.5, above=14.0)
+    page.heading("Closures and scores")
     page.write(
         (
             "d²: squared Mahalanobis distance of the closure given drift and closure "
@@ -95,7 +94,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """Return the corrected paths for the map, one per kind of correction."""
+    """Return the corrected paths that the map shows."""
     return [path for path in loop.reported_paths if path.name in PATH_STYLES]
 
 
@@ -106,20 +105,13 @@ def _draw_map(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Draw each corrected path from above, with the end of the odometry and the true end."""
+    """Draw the uncorrected and corrected paths from above, with the closure error as an arrow."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
     for corrected_path in shown_paths(loop):
-        position = corrected_path.trajectory.position_m[
-            :: max(1, len(corrected_path.trajectory) // MAX_MAP_POINTS)
-        ]
-        axes.plot(
-            position[:, 1],
-            position[:, 0],
-            label=corrected_path.name,
-            **PATH_STYLES[corrected_path.name],
-        )
+        track, name = corrected_path.trajectory, corrected_path.name
+        plot_path(axes, track.position_m[:, (1, 0)], track.time_s, label=name, **PATH_STYLES[name])
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
@@ -136,7 +128,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    """Draw the first reference, aligned to the odometry's frame with the best correction."""
+    """Draw the reference trajectory in the frame of the odometry."""
     for reference in loop.references[:1]:
         score = loop.best.scores.get(reference.name)
         if isinstance(score, Evaluation):
@@ -162,7 +154,7 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write closure error, gate, and a table of the corrected paths with their ATE."""
+    """Write the closure error, the test of the closure, and the ATE of each corrected path."""
     path = loop.odometry.trajectory
     track_text = (
         f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
@@ -202,13 +194,13 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         if names
         else (
             "No ground truth and no reference trajectory, so the error of the path is "
-            "unknown. Give one with --reference FILE."
+            "unknown. Add a reference trajectory with --reference FILE."
         )
     )
 
 
 def write_scores(page: Page, loop: Loop) -> None:
-    """Write the tables of closures (gate, weights) and RPE, and the method of the evaluation."""
+    """Write a table of the loop closures, and a table of the RPE against each reference."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -218,9 +210,9 @@ def write_scores(page: Page, loop: Loop) -> None:
             f"{closure.degrees_of_freedom}",
             format_p_value(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
+            "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
-        cells.append("–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}")
-        colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
+        colour = "black" if closure.accepted else RED
         rows.append([(cell, colour) for cell in cells])
     if rows:
         page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
@@ -232,7 +224,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         evaluations = {
             name: score for name, score in scores.items() if isinstance(score, Evaluation)
         }
-        page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
+        page.heading(f"RPE against {reference.name}")
         missing_reasons = (
             score.reason for score in scores.values() if isinstance(score, Unavailable)
         )
@@ -272,7 +264,7 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """Format the loop closure error in m, in percent of the path, per axis and in heading."""
+    """Format the closure error in m, in percent of the path length, and its heading error."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
@@ -287,18 +279,16 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    """Format the chi-square test of one loop closure."""
-    verdict = "accepted (consistent with the stated drift)"
-    if not closure.accepted:
-        verdict = "REJECTED (not explained by the stated drift)"
+    """Format the chi-square test of a loop closure."""
+    verdict = "accepted: consistent" if closure.accepted else "REJECTED: not consistent"
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}); {verdict} with the stated drift"
     )
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
-    """Format the two times of a loop closure (s); UNIX timestamps count from the first pose."""
+    """Format the times of the two poses of a loop closure (s)."""
     if closure.source == LANDING_SOURCE:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
@@ -310,17 +300,20 @@ def by_distance_sentence(loop: Loop) -> str:
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "With headings, each step is also rotated by its share of the heading error."
+    headings = (
+        "The correction with headings also rotates each motion by a part of the heading error."
+    )
     if isinstance(heading_deg, Unavailable):
         headings = f"The correction of headings is missing: {heading_deg.reason}."
     return (
-        "The correction by distance, positions only, moves each position by its share of the "
-        f"closure error (Example 2 of lesson UAT 366, module 2). {headings}"
+        "The correction by distance shifts each position by a part of the closure error that is "
+        "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
+        f"{headings}"
     )
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return why corrections of the path were not computed, each reason once."""
+    """Return a sentence on each missing correction of the path, without repetitions."""
     unavailable = [
         correction
         for correction in loop.corrections.values()
@@ -353,7 +346,7 @@ def format_correction(correction: CorrectedPath) -> str:
 
 
 def graph_summary(solved_graph: Graph) -> Page:
-    """Make the terminal page of a pose graph: gate, solver and costs."""
+    """Make the terminal page of a pose graph: tested closures, solver and costs."""
     page = Page()
     page.write_labelled(
         "Graph",
@@ -366,7 +359,7 @@ def graph_summary(solved_graph: Graph) -> Page:
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.write_labelled("Gate", "no closures to test: every edge is odometry")
+        page.write_labelled("Gate", "the graph has no loop closures to test")
     else:
         rejected_gates = [gate for gate in gates if not gate.accepted]
         lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected_gates]
@@ -376,7 +369,8 @@ def graph_summary(solved_graph: Graph) -> Page:
         )
         if len(gates) > MAX_ROBUST_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(
-                "Robust", "not solved for this many closures; add --robust (takes some minutes)"
+                "Robust",
+                "the robust solution is missing, because the graph has many closures; add --robust",
             )
     unconverged = [
         SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged

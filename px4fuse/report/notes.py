@@ -24,19 +24,18 @@ if TYPE_CHECKING:
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
-BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
-INDENT = 12.0  # points
-MAX_INDENTS = 8
-# Each level takes three levels of Python's call stack, which is limited to 1000
+INDENT = 12.0  # indent (points) of each list level
+MAX_INDENTS = 8  # maximum number of indents of a text
+# Maximum depth of nested Markdown: each level needs three of Python's 1000 stack levels
 MAX_NESTING = 100
-# An opening $ has no space after it, a closing $ no space before and no digit after it, so prices
-# such as $5 and $10 are not mathematics
+# No space follows an opening $. No space precedes and no digit follows a closing $, so prices such
+# as $5 and $10 are not mathematics
 MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
 COMMAND_PATTERN = re.compile(r"\\([A-Za-z]+|.)")
 FRACTION_PATTERN = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-# TeX commands without an HTML entity of the same name and meaning
+# Text of each TeX command without an HTML entity of the same name and meaning
 SYMBOLS = {
     "cdot": "·",
     "sqrt": "√",
@@ -55,7 +54,7 @@ SYMBOLS = {
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes of the student; no page if both are missing."""
+    """Draw the answer form and the notes of the student; no page without both."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
@@ -114,16 +113,16 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
-    """Write the blocks below a Markdown node, with the list mark before the first line."""
+    """Write the child blocks of a Markdown node; `mark` precedes the first line of a list item."""
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
-        page.write("", size=BODY_SIZE, indent=indent, mark=mark)
+        page.write("", indent=indent, mark=mark)
         mark = ""
     for child in children:
         match child.type:
             case "heading":
-                size = HEADING_SIZES.get(child.tag, BODY_SIZE)
+                size = HEADING_SIZES.get(child.tag, 8.0)
                 page.write(_inline_text(child), size=size, bold=True, indent=indent, above=6.0)
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
@@ -142,14 +141,10 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
                 head, *body = ([_inline_text(cell) for cell in row] for row in rows)
                 page.table(head, body, column_widths=[1.0] * len(head))
             case "html_block":
-                page.write(
-                    TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent
-                )
+                page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraphs; a horizontal rule has no text
                 above = 0.0 if mark else 2.0
-                page.write(
-                    _inline_text(child), size=BODY_SIZE, indent=indent, mark=mark, above=above
-                )
+                page.write(_inline_text(child), indent=indent, mark=mark, above=above)
         mark = ""
 
 
@@ -175,7 +170,7 @@ def _node_text(node: SyntaxTreeNode) -> str:
 
 
 def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Parse mathematics in dollar signs (rule of markdown-it); code and escapes take precedence."""
+    """Parse mathematics between dollar signs as a rule of markdown-it."""
     maths_match = MATHS_PATTERN.match(state.src, state.pos)
     if maths_match is None:
         return False
@@ -191,6 +186,6 @@ def _tex_to_text(maths: str) -> str:
 
 
 def _maths_symbol(command_match: re.Match[str]) -> str:
-    """Return the Unicode character of a TeX command; most names equal those of HTML entities."""
+    """Return the Unicode character of a TeX command, from HTML entities with the same name."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

@@ -14,16 +14,19 @@ from typing import Any
 from px4fuse.core.text import with_log_name
 from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
 
-# points; widths of the text, of the tick labels left of axes, of the labels before texts
-PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 178.0 * 72.0 / 25.4, 30.0, 52.0
-# points; gap between two columns of 86.5 mm, margin right of axes
-COLUMN_GAP, AXES_RIGHT = 5.0 * 72.0 / 25.4, 8.0
-# points; of a legend: height of a line, and width of the line and the gaps of an entry
-LEGEND_LINE, LEGEND_HANDLE = 12.0, 30.0
-# points; heights below axes for tick labels, for the axis label, and without tick labels
-TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 12.5, 3.0
-ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # printed, although str.isprintable is False
-# Words this long are split, because PDF/A limits strings to 32,767 characters
+PAGE_WIDTH = 178.0 * 72.0 / 25.4  # width (points) of the text on a page
+COLUMN_GAP = 5.0 * 72.0 / 25.4  # gap (points) between two columns
+LABEL_WIDTH = 52.0  # width (points) of the labels of texts
+AXIS_LEFT = 30.0  # width (points) for the tick labels left of the axes
+AXES_RIGHT = 8.0  # margin (points) right of the axes
+LEGEND_LINE = 12.0  # height (points) of one line of a legend
+LEGEND_HANDLE = 30.0  # width (points) of the line sample and the gaps of a legend entry
+TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
+AXIS_LABEL_HEIGHT = 12.5  # height (points) of the axis label below the tick labels
+UNLABELLED_HEIGHT = 3.0  # height (points) below axes without tick labels
+# Characters that are printed although str.isprintable is False for them
+ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"
+# Words of at least 500 characters are split, because PDF/A limits strings to 32,767 characters
 LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
@@ -45,7 +48,7 @@ class Page:
             self.add("title", text=title, lead=lead)
 
     def add(self, kind: str, **fields: Any) -> Block:
-        """Add a block of a kind that ``report.typ`` sets, and return it."""
+        """Add a block, which ``report.typ`` typesets according to its kind, and return it."""
         self.blocks.append({"kind": kind, **fields})
         return self.blocks[-1]
 
@@ -65,35 +68,32 @@ class Page:
             block = styled_text(text, size, colour, bold)
             self.add("text", above=above, indent=indent, mark=mark, **block)
 
-    def heading(self, text: str, size: float = 9.0, above: float = 6.0) -> None:
+    def heading(self, text: str) -> None:
         """Write a heading within the page."""
-        self.add("heading", above=above, **styled_text(text, size, bold=True))
+        self.add("heading", **styled_text(text, 9.5, bold=True))
 
     def write_small(self, text: str) -> None:
-        """Write a text in small print, such as the numbers of the panel above."""
+        """Write a grey text close below a plot or table, for example its numbers."""
         self.write(text, colour=MUTED_COLOUR, above=-1.0)
 
     def write_labelled(
         self,
         label: str,
         *texts: str | Block,
-        size: float = 8.0,
         width: float = LABEL_WIDTH,
         above: float = 0.0,
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label with paragraphs beside it, styled by :func:`styled_text`."""
-        styled_texts = [
-            styled_text(text, size) if isinstance(text, str) else text for text in texts
-        ]
-        styled_label = styled_text(label, size, colour, bold)
+        """Write a label and, right of it, paragraphs."""
+        styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
+        styled_label = styled_text(label, 8.0, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
-    def write_labelled_texts(self, texts: Mapping[str, str], size: float = 8.0) -> None:
+    def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         """Write each text of a mapping beside its label."""
         for label, text in texts.items():
-            self.write_labelled(label, text, size=size)
+            self.write_labelled(label, text)
 
     def table(
         self,
@@ -102,7 +102,6 @@ class Page:
         *,
         column_widths: Sequence[float] | None = None,
         right_aligned_columns: Sequence[int] = (),
-        size: float = 8.0,
     ) -> None:
         """Add a table with a heading row.
 
@@ -113,7 +112,7 @@ class Page:
         column_widths : sequence of float, optional
             Relative widths of the columns; by default they follow the content.
         right_aligned_columns : sequence of int
-            Right-aligned columns (numbers).
+            Indices of the columns with numbers.
         """
         self.add(
             "table",
@@ -121,7 +120,6 @@ class Page:
             rows=rows,
             column_widths=column_widths,
             right=right_aligned_columns,
-            size=size,
         )
 
     def panel(
@@ -133,16 +131,15 @@ class Page:
         above: float = 4.0,
         left: float = AXIS_LEFT,
         right: float = AXES_RIGHT,
-        space_below: float = 0.0,
         is_compact: bool = False,
     ) -> Axes:
-        """Add axes as wide as the column, below a title and a caption; return them.
+        """Add axes below a title and a caption; return the axes.
 
         Parameters
         ----------
         height : float
             Height of the axes alone (points).
-        above, left, right, space_below : float
+        above, left, right : float
             Margins of the axes (points); the height of tick and axis labels is added below.
         is_compact : bool
             Small title and gaps, for the cover.
@@ -153,7 +150,7 @@ class Page:
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
         axes.locator_params(axis="x", nbins=8)
         axes.locator_params(axis="y", nbins=4)
-        margins = left, right, space_below, above
+        margins = left, right, above
         alt = ": ".join(filter(None, (title, caption)))
         block = self.add(
             "panel",
@@ -171,7 +168,7 @@ class Page:
         return axes
 
     def legend(self, entries: Iterable[Artist]) -> Block:
-        """Add a legend for several panels, on as many lines as its entries need."""
+        """Add a legend on as many lines as its entries need."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
@@ -210,40 +207,40 @@ class Page:
             compact=False,
         )
 
-    def add_columns(self, *columns: Page, gap: float = COLUMN_GAP, above: float = 6.0) -> None:
-        """Add columns side by side; `gap` between and space `above` them in points."""
+    def add_columns(self, *columns: Page, above: float = 6.0) -> None:
+        """Add columns side by side, with a space `above` them in points."""
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
-        self.add("columns", columns=blocks, widths=widths, gap=gap, above=above)
+        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
 
 
-def halves(left_fraction: float = 0.5, gap: float = COLUMN_GAP) -> tuple[Page, Page]:
+def halves(left_fraction: float = 0.5) -> tuple[Page, Page]:
     """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
-    left = left_fraction * (PAGE_WIDTH - gap)
-    return Page(width=left), Page(width=PAGE_WIDTH - gap - left)
+    free_width = PAGE_WIDTH - COLUMN_GAP
+    return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
 
-def styled_text(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
+def styled_text(text: str, size: float = 8.0, colour: str = "black", bold: bool = False) -> Block:
     """Return a text with its size (points), colour and weight."""
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
-def text_width(text: str, size: float = 8.0) -> float:
-    """Return the width (points) of a text in DejaVu Sans."""
+def text_width(text: str) -> float:
+    """Return the width (points) of a text in DejaVu Sans of 8 points."""
     from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
-    # at a large size, because glyphs of a small one are rounded to whole points
+    # measured at a large size, because widths at a small one are rounded to whole points
     font.set_size(100.0, 72.0)
     font.set_text(text, 0.0)
-    return float(font.get_width_height()[0]) / 64.0 * size / 100.0
+    return float(font.get_width_height()[0]) / 64.0 * 0.08
 
 
-def line_count(text: str, width: float, size: float = 8.0) -> int:
+def line_count(text: str, width: float) -> int:
     """Return the number of lines of a text that wraps at a width (points)."""
     lines, used_width = 1, 0.0
     for word in text.split(" "):
-        word_width = text_width(f"{word} ", size)
-        if used_width and used_width + text_width(word, size) > width:
+        word_width = text_width(f"{word} ")
+        if used_width and used_width + text_width(word) > width:
             lines, used_width = lines + 1, 0.0
         used_width += word_width
     return lines
@@ -258,21 +255,21 @@ def appendix_title(title: str) -> str:
     return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
-def draw_legend_above(axes: Axes, column_count: int = 9, **options: Any) -> None:
-    """Draw the legend of a panel above its axes, at the right."""
+def draw_legend_above(axes: Axes) -> None:
+    """Draw the legend of axes above them, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
-        ncols=column_count,
+        ncols=9,
         borderaxespad=0.0,
         borderpad=0.1,
         columnspacing=1.2,
-        **options,
+        handlelength=1.4,
     )
 
 
 def replace_unprintable(text: str) -> str:
-    """Remove control characters, split long words, replace characters without a font by □."""
+    """Remove control characters, split long words, and replace characters without a font by □."""
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     return "".join(
@@ -283,7 +280,7 @@ def replace_unprintable(text: str) -> str:
 
 
 def to_typst_data(block: Any, log: str) -> Any:
-    """Convert blocks for Typst: printable text, commands with the log's name, figures as SVG."""
+    """Convert blocks to data for Typst: printable texts, and figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(with_log_name(block, log))
     if isinstance(block, Mapping):
@@ -307,11 +304,11 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 
 def _place_axes(block: Mapping[str, Any]) -> None:
-    """Set the height of the figure and the place of its axes, with room for the labels it has."""
+    """Set the height of the figure and the position of its axes according to the labels."""
     axes, width, height = block["axes"], block["width"], block["height"]
-    left, right, below, above = block["margins"]
+    left, right, above = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
-    below += (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
+    below = (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
         AXIS_LABEL_HEIGHT if axes.get_xlabel() else 0.0
     )
     total_height = above + height + below

@@ -1,4 +1,4 @@
-"""Panels over time for one axis, used by all pages: curves, caption, and numbers below."""
+"""Plots over time along one axis, with caption and numbers."""
 
 from __future__ import annotations
 
@@ -14,18 +14,27 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
-from px4fuse.report.page import Page
+from px4fuse.report.page import Block, Page
 from px4fuse.report.phrases import filters_by_name, format_verdict
-from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
+from px4fuse.report.style import (
+    DOTS,
+    LINES,
+    Artist,
+    Axes,
+    draw_curve,
+    draw_sigma_band,
+    set_log_scale,
+)
 
-NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
-# Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile of
-# |ν|, which counts up to MAX_EDGE_SIGMAS √S. Innovations outside are drawn at the edge and counted
-EDGE_FACTOR, MAX_EDGE_SIGMAS = 1.3, 5.0
+NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
+# Ratio of the half height of the innovation plot to the larger of 2√S and the 99 % quantile of |ν|
+EDGE_FACTOR = 1.3
+# Maximum 99 % quantile of |ν|, in √S, that enlarges the innovation plot
+MAX_EDGE_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Position or velocity: its unit, and the columns and fields that contain its values."""
+    """Columns and fields with the values of position or velocity, and their unit."""
 
     unit: str
     column: str
@@ -76,7 +85,7 @@ class Panel(NamedTuple):
         if not is_narrow:
             caption, height = self.caption(analysis, result), self.height
             title, numbers = ": ".join(filter(None, (title, numbers))), ""
-        # the panel of innovations shows the rejected ones as hollow dots
+        # the plot of innovations shows rejected positions as hollow dots, so it has no other mark
         rejection_axis = "" if self is INNOVATIONS else result.axis.name
         axes = event_marks.panel(
             page,
@@ -92,6 +101,23 @@ class Panel(NamedTuple):
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.in_flight)
         page.write_small(numbers)
+
+
+def add_legend(page: Page, analysis: Analysis) -> Block:
+    """Add the legend of tracks and events to a page."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+    from matplotlib.patches import Patch  # noqa: PLC0415
+
+    result = analysis.main
+    lines: list[Artist] = [
+        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="position"),
+        Line2D([], [], **LINES["KF"], label="KF"),
+        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
+    ]
+    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
+        if isinstance(track, pd.DataFrame):
+            lines.append(Line2D([], [], **LINES[name], label=name))
+    return page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
@@ -119,7 +145,7 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _error_numbers(result: AxisComparison, quantity: Quantity) -> list[str]:
-    """Return the RMSE against ground truth of each filter for which it is known."""
+    """Format the RMSE of each filter against ground truth."""
     values = {
         name: getattr(filter_summary.truth, quantity.rmse, None)
         for name, filter_summary in filters_by_name(result).items()
@@ -149,7 +175,7 @@ def _velocity_numbers(result: AxisComparison) -> str:
 
 
 def _axis_half_height(result: AxisComparison) -> float:
-    """Return the half height (m) of the innovation axes; outliers and gaps do not enlarge it."""
+    """Return the half height (m) of the plot of innovations, which outliers do not enlarge."""
     limits = []
     for innovations in (result.replay.updates, result.ekf2_innovations):
         if isinstance(innovations, pd.DataFrame):
@@ -162,7 +188,7 @@ def _axis_half_height(result: AxisComparison) -> float:
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
-    """Return the finite ν/√S of KF and of EKF2, if logged, by filter name."""
+    """Return ν/√S of KF and, if logged, of EKF2, by filter name."""
     return {
         name: (
             innovations["innovation_m"] / np.sqrt(innovations["innovation_variance_m2"])
@@ -172,13 +198,22 @@ def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]
     }
 
 
+def draw_dots(
+    axes: Axes, values: pd.Series[float], limit: float, marker_style: dict[str, Any]
+) -> None:
+    """Draw dots between -limit and limit, and triangles there for values beyond."""
+    draw_curve(axes, values[values.abs() <= limit], **marker_style)
+    for sign, marker in ((1.0, "^"), (-1.0, "v")):
+        beyond = values[sign * values > limit]
+        triangles = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
+        if len(beyond):
+            draw_curve(axes, 0.0 * beyond + sign * limit, **triangles)
+
+
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
-    half_height, updates, ekf2_innovations = (
-        _axis_half_height(result),
-        result.replay.updates,
-        result.ekf2_innovations,
-    )
+    half_height, ekf2_innovations = _axis_half_height(result), result.ekf2_innovations
+    updates = result.replay.updates
     kf_innovations = updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
@@ -195,26 +230,12 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
             *dots,
         ]
     for values, marker_style in dots:
-        draw_curve(axes, values[values.abs() <= half_height], **marker_style)
-        for sign, marker in ((1.0, "^"), (-1.0, "v")):
-            outside_times = values.index[sign * values > half_height]
-            edge_style: dict[str, Any] = {
-                **marker_style,
-                "marker": marker,
-                "ms": 3.2,
-                "clip_on": False,
-            }
-            if len(outside_times):
-                axes.plot(
-                    outside_times,
-                    np.full(len(outside_times), sign * 0.96 * half_height),
-                    **edge_style,
-                )
-    axes.set_ylim(-half_height, half_height)
+        draw_dots(axes, values, half_height, marker_style)
+    axes.set_ylim(-1.04 * half_height, 1.04 * half_height)
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """Return the caption of the innovations: verdict, mean, standard deviation, rejections."""
+    """Return the caption of the innovations: verdict, mean, standard deviation and rejections."""
     half_height, sentences = _axis_half_height(result), []
     innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
@@ -222,7 +243,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {consistency.reason}.")
             continue
         table = innovation_tables[name]
-        assert isinstance(table, pd.DataFrame)  # the filter has a verdict
+        assert isinstance(table, pd.DataFrame)  # filters with a verdict have innovations
         outside_count = int((table["innovation_m"].abs() > half_height).sum())
         outside = f", {outside_count} outside the plot (triangles)" if outside_count else ""
         sentences.append(
@@ -235,7 +256,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
     elif isinstance(result.ekf2_innovations, pd.DataFrame):
         count = int((result.ekf2_innovations["rejected"] > 0).sum())
-        sentences += [f"EKF2 rejected {count} (hollow)."] if count else []
+        sentences += [f"EKF2 rejected {count} positions (hollow dots)."] if count else []
     return " ".join(sentences)
 
 
@@ -256,7 +277,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
-    """Return the caption of σ: its growth in the longest gap of the source; "" without a gap."""
+    """Return the caption of σ: its growth in the longest gap of the position source."""
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])

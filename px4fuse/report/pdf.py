@@ -18,7 +18,6 @@ from px4fuse.report import (
     loop,
     notes,
     provenance,
-    sensitivity,
 )
 from px4fuse.report.page import Page, replace_unprintable, to_typst_data
 from px4fuse.report.phrases import student_line
@@ -37,7 +36,6 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         difference_page.draw,
         flight.draw_other_axes,
         consistency.draw,
-        sensitivity.draw,
         clock.draw,
         aids.draw,
         loop.draw,

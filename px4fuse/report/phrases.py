@@ -15,7 +15,7 @@ from px4fuse.comparison.model import (
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.log import ClockMap
 from px4fuse.flight.model import Alignment, Truth, Unavailable
@@ -46,7 +46,7 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Format the verdict on the σ of a filter; "not logged" without its innovations."""
+    """Format the verdict on the reported σ of a filter; "not logged" without innovations."""
     if isinstance(consistency, Unavailable):
         return "not logged"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
@@ -78,7 +78,7 @@ def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
-    """Return a table row per axis and filter: mean NIS, its band, verdict, then the extra cells."""
+    """Return a table row for each axis and filter: mean NIS, 95 % band, verdict, extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
@@ -133,7 +133,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return notes on verdicts about σ that could be misread.
+    """Return notes against misreading the verdicts on σ.
 
     They concern a source that may drift, deviations too small for a finding, and innovations that
     are consistent but not white.
@@ -157,19 +157,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     ]
     if correlated:
         notes.append(
-            "Innovations are not white, although their size is consistent (Ljung-Box test, p < "
-            f"{MIN_WHITE_P:g}): {'; '.join(correlated)}. Positive: the filter lags, SIGMA_A may "
-            "be too small. Negative: the filter follows the measurement noise, SIGMA_A may be too "
-            "large."
+            "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
+            f"< {MIN_WHITE_P:g}): {'; '.join(correlated)}. If the autocorrelation is positive, the "
+            "filter lags and SIGMA_A may be too small. If it is negative, the filter follows the "
+            "measurement noise and SIGMA_A may be too large."
         )
     return notes
-
-
-def format_consequences(consequences: Sequence[Finding]) -> str:
-    """Format the findings that are consequences of another finding, with their ids."""
-    return "Consequences: " + " ".join(
-        f"{finding.title} [{finding.id}]." for finding in consequences
-    )
 
 
 def format_clock_map(clock: ClockMap) -> str:
@@ -185,7 +178,7 @@ def format_clock_map(clock: ClockMap) -> str:
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
-    """Return the alignment of a position file with the flight as labelled texts."""
+    """Format the alignment of a position file with the flight, by label."""
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
@@ -207,7 +200,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return the actions after noise estimation by label: command, PX4 parameter, cautions.
+    """Return the recommended actions after noise estimation, by label.
 
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
@@ -239,8 +232,8 @@ def tuning_advice(
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
-            f"SIGMA_Z cannot be estimated at this logging rate{bound}: the process noise between "
-            "samples masks it. Log the source at a higher rate."
+            f"SIGMA_Z cannot be estimated at this logging rate{bound}: it is masked by the process "
+            "noise between samples. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         px4_value = log.parameters.get("EKF2_EVP_NOISE")
@@ -272,12 +265,12 @@ def tuning_advice(
 
 
 def student_line(student: Student, separator: str) -> str:
-    """Join the student's name and id; either may be empty."""
+    """Join the name and the id of the student."""
     return separator.join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    """Write all findings, each with its consequences."""
+    """Write all findings, each followed by its consequences."""
     if not findings:
         page.write("None.")
     for findings_of_cause in group_by_root(findings):
@@ -285,17 +278,29 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
-    """Write severity, time, title with id, message, action and consequences of a finding."""
+    """Write one finding and its consequences."""
     finding, *consequences = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
         texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
     if consequences:
-        texts.append(styled_text(format_consequences(consequences), 8.0, MUTED_COLOUR))
+        titles = " ".join(f"{finding.title} [{finding.id}]." for finding in consequences)
+        texts.append(styled_text(f"Consequences: {titles}", 8.0, MUTED_COLOUR))
     page.write_labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,
         above=2.0,
         colour=SEVERITY_COLOURS[finding.severity],
     )
+
+
+def format_noise_estimate(noise: Noise) -> str:
+    """Format a maximum-likelihood noise and its 95 % interval, without the unit."""
+    if noise.value is None:
+        bounds = (("at most", noise.high), ("at least", noise.low))
+        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
+        return next(texts, "not identifiable")
+    low = "0" if noise.low is None else f"{noise.low:.2g}"
+    high = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low}-{high})"

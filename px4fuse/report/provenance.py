@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
@@ -59,7 +58,7 @@ def _findings_page(results: ComparisonResults | AidsResults) -> Page:
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """Write log, position source and parameters, without those of unused position sources.
+    """Write log, position source and parameters.
 
     Names and SHA-256 of the files are last, so that they stand on the last page.
     """
@@ -67,25 +66,12 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
     other_positions = (
         f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source
     )
-    unused_parameters = set[str]()
     if source is not None:
-        aid = source.origin.aid or EV_POS
-        unused_parameters = unused_parameters.union(
-            *(
-                position_aid.own_parameters
-                for position_aid in (EV_POS, GNSS_POS)
-                if position_aid != aid
-            )
-        )
         facts["position source"] = (
             f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
-    parameters = (
-        f"{name} {value:g}"
-        for name, value in log.parameters.items()
-        if name not in unused_parameters
-    )
+    parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
     facts = {
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
         "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
@@ -154,10 +140,10 @@ def _write_section(
     labelled_texts: Iterable[tuple[str, str]] = (),
     plain_texts: Iterable[str] = (),
 ) -> None:
-    """Write a heading, then labelled and plain texts in small print; nothing without texts."""
+    """Write a heading and texts in small print; nothing without texts."""
     labelled_texts, plain_texts = list(labelled_texts), list(plain_texts)
     if labelled_texts or plain_texts:
-        page.heading(title, 9.5, above=9.0)
+        page.heading(title)
     for label, text in labelled_texts:
         page.write_labelled(
             label,

@@ -31,10 +31,10 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Encodings of terminals that can print all characters of a card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Functions that yield the lines of a card, by kind of block
+# Function that yields the lines of a card, by kind of block
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
-INDENT = 9  # number of columns of a label
-COLUMN_POINTS = 6.0  # indent on paper (points) that corresponds to one column of the terminal
+INDENT = 9  # number of characters of a label
+COLUMN_POINTS = 6.0  # indent in the PDF (points) for one character on the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES = {
     MUTED_COLOUR: "dim",
@@ -43,7 +43,7 @@ STYLES = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# Commands in a text; a full stop after a value ends the sentence and is not part of the command
+# Commands in a text, without the full stop of the sentence
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
@@ -75,9 +75,6 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 console.print()
             case "card" | "closing" | "headline":
                 _show_card(console, CARD_LINES[block["kind"]], block["card"], request)
-            case "columns":
-                for column in block["columns"]:
-                    show(console, column, request)
 
 
 def _show_card(
@@ -110,7 +107,7 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
 
 
 def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Shorten each command in a text to its options; return the text and the complete commands.
+    """Shorten the commands in a text to their options; return the text and the complete commands.
 
     Parameters
     ----------
@@ -164,7 +161,7 @@ def print_paragraph(
 
 
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
-    """Print a command or path on one line without wrapping, so it can be copied."""
+    """Print a command or path on one line, so it can be copied."""
     console.print(Text(f"{label:{INDENT}}", "bold").append(text, style), soft_wrap=True)
 
 
@@ -174,7 +171,6 @@ def _rich_table(
     right: Sequence[int],
     **_: object,
 ) -> Table:
-    """Return a table without rules; a head may have several lines."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     vertical_alignment: Literal["bottom", "top"] = (
         "bottom" if any("\n" in title for title in head) else "top"

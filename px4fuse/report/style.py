@@ -1,4 +1,4 @@
-"""Colours, lines and matplotlib settings of all panels.
+"""Colours, lines and matplotlib settings of all plots.
 
 KF is dark, solid and round, EKF2 lighter, dashed and square, so they remain distinct in grey. Text
 from outside (names, notes) is drawn literally, without mathematics or markup.
@@ -20,10 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.colors import Colormap
 else:  # importing matplotlib takes 0.3 s, which text-only commands save
-    Artist = Axes = Colormap = Any
-__all__ = ["Artist", "Axes", "Colormap"]  # matplotlib types for annotations
+    Artist = Axes = Any
+__all__ = ["Artist", "Axes"]  # matplotlib types for annotations
 
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
@@ -47,35 +46,37 @@ CONSISTENT_BAND_COLOUR = "#d5dfd8"
 
 
 def line_style(colour: str, width: float, dashes: object = "-") -> dict[str, Any]:
-    """Return matplotlib's options of a line; ``dashes`` is a line style of matplotlib."""
+    """Return the matplotlib options of a line."""
     return {"color": colour, "lw": width, "ls": dashes}
 
 
 def dot_style(colour: str, marker: str | int, size: float, edge: float = 0.0) -> dict[str, Any]:
-    """Return matplotlib's options of markers without a line; size and edge width in points."""
+    """Return the matplotlib options of markers without a line; size and edge width in points."""
     return {"color": colour, "marker": marker, "ms": size, "mew": edge, "ls": "none"}
 
 
-KF_LINE = line_style(KF_COLOUR, 1.0)
-EKF2_LINE = line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6)))
-TRUTH_LINE = line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5)))
-KF_DOTS = dot_style(KF_COLOUR, "o", 2.0)
-EKF2_DOTS = dot_style(EKF2_COLOUR, "s", 2.2)
-# Samples that EKF2 did not fuse are hollow in all panels
+# Style of the line of each track, by its name in legends
+LINES = {
+    "KF": line_style(KF_COLOUR, 1.0),
+    "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
+    "ground truth": line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5))),
+}
+# Style of the innovations of each filter
+DOTS = {"KF": dot_style(KF_COLOUR, "o", 2.0), "EKF2": dot_style(EKF2_COLOUR, "s", 2.2)}
+# Innovations that EKF2 rejected are hollow in all plots
 EKF2_REJECTED = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_DOTS = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-# Styles of lines, dots and bands by the name of the track in legends
-LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
-DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
+# Colour of the ±2σ band of each filter
 BANDS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-# Maximum number of drawn points in wide and in narrow axes; minimum width (inches) of wide axes
-MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
+MAX_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
+MAX_POINTS_NARROW = 500  # maximum number of drawn points of a curve in narrow axes
+MIN_WIDE_INCHES = 3.0  # minimum width (inches) of wide axes
 
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Apply the matplotlib settings of the panels within a with block."""
+    """Apply the matplotlib settings of the report within a with block."""
     import matplotlib as mpl  # noqa: PLC0415 - slow import
 
     with mpl.rc_context({"font.family": [FONT]}, STYLE_SHEET):
@@ -83,7 +84,7 @@ def report_style() -> Iterator[None]:
 
 
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
-    """Draw a series over its index, reduced to as many points as the axes can show."""
+    """Draw a time series, reduced to the number of points that the axes can show."""
     axes.plot(
         *decimate_series(
             values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)
@@ -120,7 +121,7 @@ def set_log_scale(axes: Axes) -> None:
 
 
 def set_plain_ticks(axis: Axis) -> None:
-    """Label a log axis with plain numbers: 1, 2 and 5 of each decade, or fewer for many decades."""
+    """Label a logarithmic axis with plain numbers: 1, 2 and 5 of each decade if they fit."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     low, high = axis.get_view_interval()
@@ -131,7 +132,7 @@ def set_plain_ticks(axis: Axis) -> None:
 
 
 def label_time_axis(axes: Axes, with_time_label: bool) -> None:
-    """Label the time axis of the last panel; hide the tick labels of the panels above it."""
+    """Label the time axis, or hide its tick labels if a plot below has them."""
     if with_time_label:
         axes.set_xlabel(TIME_LABEL)
     else:
@@ -143,10 +144,12 @@ def set_map_axes(axes: Axes, right: str, up: str) -> None:
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
+    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="y", nbins=6)
 
 
 def decimate_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
-    """Reduce a series to at most ``limit`` points: minimum and maximum of equal intervals."""
+    """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
     if len(time) <= limit:
         return time, value
     bucket_size, larger_bucket_count = divmod(len(time), limit // 2)

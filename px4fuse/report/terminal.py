@@ -33,7 +33,7 @@ def summary(
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal page of a comparison, or of a flight without a position source.
+    """Make the terminal page of `px4fuse compare`.
 
     Parameters
     ----------
@@ -69,14 +69,14 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 
 
 def card_page(part: str, card: Card) -> Page:
-    """Make a page with a part of a card: "card", "headline", or "closing" (where to read more)."""
+    """Make a page with a diagnosis card, its headline, or its closing lines."""
     page = Page()
     page.add(part, card=card)
     return page
 
 
 def facts(comparison: Comparison) -> dict[str, str]:
-    """Return filter settings, position source, alignment and segment as texts by label."""
+    """Return filter settings, position source, alignment and segment, by label."""
     source, segment = comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "

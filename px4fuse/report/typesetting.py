@@ -1,4 +1,4 @@
-"""Typesetting of pages by Typst, which reads the given data and templates only.
+"""Typesetting of pages by Typst, which can read no other files.
 
 The root of Typst is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
 """
@@ -33,7 +33,7 @@ def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
-    """Typeset a cover without panels and return the height (pt) that is left for them.
+    """Typeset a cover without plots and return the height (points) below the card.
 
     Parameters
     ----------

@@ -1,13 +1,17 @@
 """Terminal page of ``px4fuse whatif``: logged, replayed and changed EKF2, and the sweep."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.core.text import format_number
-from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import ADDED_NOISE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
+from px4fuse.ekf2.whatif import (
+    ADDED_NOISE_M,
+    HEIGHT_TIMEOUT_S,
+    MAX_REJECTED_SHARE,
+    AxisSummary,
+    HeightSummary,
+    Summary,
+)
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.flight.model import Unavailable
@@ -15,33 +19,10 @@ from px4fuse.report.difference_page import format_agreement, write_explanation
 from px4fuse.report.page import Page
 
 NOT_PREDICTABLE = "not predictable"
-Rows = tuple[tuple[str, Callable[[Any], str]], ...]
-# Label of each table row, and the function that formats its statistic of an axis or aiding source
-NIS_ROWS: Rows = (
-    ("{}: mean NIS", lambda summary: format_number(summary.nis_mean)),
-    ("    expected", lambda summary: "{:.2f} to {:.2f}".format(*summary.nis_band)),
-    ("    std of ν (m)", lambda summary: _format_number(summary.innovation_std_m)),
-)
-AXIS_ROWS: Rows = (
-    *NIS_ROWS,
-    ("    median σ_p (m)", lambda axis: _format_number(axis.sigma_p_median_m)),
-    ("    position RMSE (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
-)
-HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_fraction:.1%}"))
-# Table rows with statistics of the whole replay of EKF2
-OVERALL_ROWS: Rows = (
-    ("samples", lambda s: f"{s.samples}"),
-    ("rejected", lambda s: f"{s.rejected_fraction:.1%}"),
-    ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
-    ("position resets", lambda s: f"{s.resets}"),
-)
-# Table rows of replays that estimate heading and height instead of taking them from the log
-HEADING_ROW = ("mean heading error (°)", lambda s: _format_number(s.heading_error_mean_deg, 1))
-HEIGHT_ROW = ("height RMSE (m)", lambda s: _format_number(s.height_rmse_to_truth_m))
 
 
 def column_heads(analysis: WhatIfAnalysis) -> list[str]:
-    """Return the heads of the columns of EKF2: logged, replayed, replayed with changes."""
+    """Return the headings of the columns: EKF2 logged, replayed, replayed with changes."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -59,54 +40,67 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
 
 
 def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return the table rows: label, then the statistic of the logged, replayed and changed EKF2."""
-    whatif_result = analysis.whatif
-    overall_rows, heights = list(OVERALL_ROWS), whatif_result.replayed.heights
-    if isinstance(whatif_result.replayed.heading_error_mean_deg, float):
-        overall_rows.append(HEADING_ROW)
-    if heights:
-        overall_rows.append(HEIGHT_ROW)
-    other_aid_updates = {**heights, **whatif_result.replayed.others}
-    tables = dict.fromkeys(HORIZONTAL, AXIS_ROWS) | {"": tuple(overall_rows)}
-    summaries = [
-        whatif_result.logged,
-        whatif_result.replayed,
-        *whatif_result.whatif[: analysis.sweep_start],
+    """Return a row for each EKF2 statistic: label, and values as logged, replayed and changed."""
+    result = analysis.whatif
+    labels = _statistics(result.replayed, result.replayed)
+    columns = [
+        _statistics(summary, result.replayed)
+        if summary.is_predictable
+        else dict.fromkeys(labels, NOT_PREDICTABLE)
+        for summary in (result.logged, result.replayed, *result.whatif[: analysis.sweep_start])
     ]
-    return [
-        [
-            label.format(AIDS[name].label if name in other_aid_updates else name),
-            *(_format_cell(summary, name, cell) for summary in summaries),
-        ]
-        for name, table in (tables | dict.fromkeys(other_aid_updates, HEIGHT_ROWS)).items()
-        for label, cell in table
-    ]
+    return [[label, *(column.get(label, "n/a") for column in columns)] for label in labels]
 
 
-def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
-    """Format a statistic of an axis or aiding source; the name "" stands for the whole replay."""
-    if not summary.is_predictable:
-        return NOT_PREDICTABLE
-    statistics = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
-    return "n/a" if statistics is None else cell(statistics)
+def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
+    """Format the statistics of EKF2, by label. ``replayed`` decides on heading and height."""
+    texts = dict[str, str]()
+    for name, axis in summary.axes.items():
+        texts |= _nis_texts(name, axis) | {
+            f"{name}: median σ_p (m)": _format_number(axis.sigma_p_median_m),
+            f"{name}: position RMSE (m)": _format_number(axis.position_rmse_to_truth_m),
+        }
+    texts |= {"samples": f"{summary.samples}", **_fusion_texts(summary)}
+    if isinstance(replayed.heading_error_mean_deg, float):
+        texts["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
+    if replayed.heights:
+        texts["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
+    for name, aid in {**summary.heights, **summary.others}.items():
+        label = AIDS[name].label
+        texts |= _nis_texts(label, aid) | {f"{label}: rejected": f"{aid.rejected_fraction:.1%}"}
+    return texts
+
+
+def _nis_texts(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, str]:
+    return {
+        f"{name}: mean NIS": format_number(statistics.nis_mean),
+        f"{name}: expected NIS": "{:.2f} to {:.2f}".format(*statistics.nis_band),
+        f"{name}: std of ν (m)": _format_number(statistics.innovation_std_m),
+    }
+
+
+def _fusion_texts(summary: Summary) -> dict[str, str]:
+    return {
+        "rejected": f"{summary.rejected_fraction:.1%}",
+        "longest time without fusion (s)": _format_number(summary.longest_without_fusion_s, 2),
+        "position resets": f"{summary.resets}",
+    }
 
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return the column heads, and a row of EKF2 statistics per value of the swept parameter."""
+    """Return the column headings, and a row of EKF2 statistics per value of the swept parameter."""
     name, rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
-    (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
     for summary in sweep_summaries(analysis):
-        cells = [NOT_PREDICTABLE, *[""] * 5]
-        if summary.is_predictable:
-            per_axis_cells = [
-                "/".join(map(cell, summary.axes.values())) for cell in (nis, sigma, rmse)
-            ]
-            cells = [
-                per_axis_cells[0],
-                *(cell(summary) for _, cell in OVERALL_ROWS[1:]),
-                *per_axis_cells[1:],
-            ]
+        axes = summary.axes.values()
+        cells = [
+            "/".join(format_number(axis.nis_mean) for axis in axes),
+            *_fusion_texts(summary).values(),
+            "/".join(_format_number(axis.sigma_p_median_m) for axis in axes),
+            "/".join(_format_number(axis.position_rmse_to_truth_m) for axis in axes),
+        ]
+        if not summary.is_predictable:
+            cells = [NOT_PREDICTABLE, *[""] * 5]
         rows.append([format_number(summary.changed[name]), *cells])
     head = [
         f"{name} ({unit})" if unit else name,
@@ -174,7 +168,7 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
-    page.write_labelled("Used", f"All columns contain {spans} of the flight.")
+    page.write_labelled("Used", f"All columns are evaluated from {spans} of the flight.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]
     page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))

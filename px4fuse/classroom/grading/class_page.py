@@ -217,15 +217,12 @@ def _points_cell(entry: Entry) -> Cell:
             else ""
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
-    fraction = (
-        min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
-    )
     notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
     notes += ["set by instructor"] * any(
         override.points is not None for override in entry.overrides.values()
     )
     text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
-    return Cell(text, entry.total, ", ".join(notes), "", fraction)
+    return Cell(text, entry.total, ", ".join(notes))
 
 
 def _point_boxes(entry: Entry) -> Section:
