@@ -30,8 +30,10 @@ SENSOR, CHANGE = "the source's sensor", "change"
 GAP = "gap"
 # Key in Finding.evidence of findings about the convention of the source, which precede all others
 CONVENTION = "convention"
-# Findings that precede all others, because no estimate from these positions is valid
+# Findings that precede all others, because no estimate from these positions or this IMU is valid.
+WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
 UNUSABLE = (
+    *WRONG_IMU,
     "source_is_ekf2_estimate",
     "source_two_senders",
     "source_positions_rounded",
@@ -121,7 +123,12 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 def _report_rank(group: list[Finding]) -> int:
     # gaps of the recording falsify estimated noises: RECORDING warnings precede NOISES errors
     cause = group[0]
-    is_first = CONVENTION in cause.evidence or cause.id in (*UNUSABLE, *MISLEADING, WITHOUT)
+    is_first = CONVENTION in cause.evidence or cause.id in (
+        *UNUSABLE,
+        *MISLEADING,
+        WITHOUT,
+        "ekf2_not_aligned",
+    )
     if is_first and cause.severity != "note":
         return -1
     ranks = {"error": 2 * (cause.id in NOISES), "warning": 3 - 2 * (cause.id in RECORDING)}
