@@ -293,6 +293,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
                     f"The error of {FILTER_NAMES[verdict.filter]} is {format_ratio(verdict.ratio)} "
                     "times its reported σ."
                 )
+        sentences += _worst_axis_sentences(analysis)
     if effect.difference_rms_m is not None and (
         not effect.position_rmse_m or all(each.word == "consistent" for each in verdicts)
     ):
@@ -309,6 +310,32 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
         times = "once" if effect.horizontal_resets == 1 else f"{effect.horizontal_resets} times"
         sentences.append(f"EKF2 reset its horizontal position {times}.")
     return " ".join(sentences)
+
+
+def _worst_axis_sentences(analysis: Analysis) -> list[str]:
+    """Describe EKF2's error along the axis with the largest ratio to σ, besides the main axis.
+
+    Empty if EKF2 is not overconfident along this axis.
+    """
+    errors = {
+        result.axis.label: truth
+        for result in analysis.secondary_axes
+        if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
+        and truth.nees_position_mean
+        and not truth.is_lag_only
+    }
+    if not errors:
+        return []
+    label, worst = max(errors.items(), key=lambda item: item[1].nees_position_mean or 0.0)
+    ratio = math.sqrt(worst.nees_position_mean or 0.0)
+    main_truth = analysis.main.filters["ekf2"].truth
+    main_nees = 0.0 if isinstance(main_truth, Unavailable) else main_truth.nees_position_mean or 0.0
+    if classify_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
+        return []
+    return [
+        f"EKF2's RMSE along {label} is {format_metres(worst.position_rmse_m)} m, "
+        f"{format_ratio(ratio)} times its reported σ."
+    ]
 
 
 def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
