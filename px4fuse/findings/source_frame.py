@@ -2,13 +2,24 @@
 
 import math
 
+import numpy as np
+
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight.model import Ekf2, Unavailable, positions_of, source_name
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    Unavailable,
+    positions_of,
+    source_name,
+)
+from px4fuse.trajectory.rotation import heading as heading_of
+from px4fuse.trajectory.rotation import interpolate
 
 # Minimum misalignment in σ for a finding: flights without a fault reach 3.2
 MIN_HEADING_SIGMAS = 4.0
@@ -16,6 +27,8 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum misalignment (°) for severity error: a quarter of the motion appears on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
+# Minimum ratio of the heading drift against ground truth to that against the positions
+MIN_TRUE_DRIFT_SHARE = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
@@ -64,7 +77,8 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect positions that move in another direction than the IMU measures."""
     rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
-        yield _drift_finding(analysis, heading)
+        if not _is_drift_refuted(analysis.flight, heading):
+            yield _drift_finding(analysis, heading)
         return
     limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
     if abs(rotation_deg) < limit_deg or _is_explained_by_bias(analysis):
@@ -102,6 +116,28 @@ def _is_explained_by_bias(analysis: Analysis) -> bool:
     if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
     return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
+
+
+def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
+    """Return True if EKF2's heading error against ground truth changes by less than half."""
+    truth, attitude = flight.truth, flight.attitude
+    if (
+        isinstance(truth, Unavailable)
+        or truth.attitude is None
+        or isinstance(attitude, Unavailable)
+    ):
+        return False
+    errors_deg = []
+    for part in heading.ends:
+        samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
+        true = interpolate(
+            samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
+        )
+        error_rad = heading_of(samples.to_numpy()) - heading_of(true)
+        wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
+        errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
+    change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
+    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_SHARE * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
