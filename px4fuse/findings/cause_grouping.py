@@ -44,6 +44,8 @@ UNUSABLE = (
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
+# Causes whose action replaces the actions of their effects
+CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
 # Kind of cause of no_motion: the vehicle stayed on the ground
 GROUND = "never took off"
 
@@ -92,7 +94,9 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
     for cause, effects in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
-        if cause_group is None or WHITE_RATIO in cause_group[0].evidence:
+        if cause_group is None or (cause_group[0].severity == "note" and cause in CORRECTED_FIRST):
+            continue
+        if WHITE_RATIO in cause_group[0].evidence:
             continue
         effect_groups = [
             group
@@ -104,7 +108,8 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         ]
         groups = [group for group in groups if group not in effect_groups]
         for effect, *further_effects in effect_groups:
-            cause_group += [replace(effect, caused_by=cause), *further_effects]
+            remedy = cause_group[0].remedy if cause in CORRECTED_FIRST else effect.remedy
+            cause_group += [replace(effect, caused_by=cause, remedy=remedy), *further_effects]
         # kf_underconfident and kf_overconfident do not increase the severity of their cause
         severities = (
             effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES

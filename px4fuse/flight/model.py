@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -415,6 +415,15 @@ def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> A
     return np.asarray(steps, dtype=np.float64)[rows]
 
 
+class ParameterChange(NamedTuple):
+    """Change of a PX4 parameter in flight, with the values before and after it."""
+
+    time_s: float
+    name: str
+    before: float
+    after: float
+
+
 @dataclass(frozen=True)
 class Ekf2:
     """State, variances and innovations of EKF2, from the primary instance at each time.
@@ -456,7 +465,9 @@ class Ekf2:
         ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
         ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
     parameters : mapping
-        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
+        All EKF2_ parameters at take-off, by PX4 name, in PX4 units.
+    parameter_changes : tuple of ParameterChange
+        Changes of EKF2_ parameters after take-off, in order of time.
     """
 
     state: pd.DataFrame
@@ -475,6 +486,7 @@ class Ekf2:
     aids: Mapping[str, AidLog] = field(default_factory=dict)
     states: StepFunctions = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
+    parameter_changes: tuple[ParameterChange, ...] = ()
 
     __repr__ = one_line_repr
 
