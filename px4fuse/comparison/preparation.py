@@ -17,7 +17,7 @@ from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segm
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.flight.position_source import POSITION_FILE
-from px4fuse.readers.mavlink_messages import POSITION_INPUTS
+from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
@@ -30,6 +30,7 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origins of position sources, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
+GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth of the log as its position source",
@@ -238,6 +239,11 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damaged}no external position in this log (no {topics})"
+    gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
+    if gnss is not None:
+        reason += f"; {gnss.source}: {gnss.reason}"
+    if flight.log.autopilot != "PX4":
+        reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
