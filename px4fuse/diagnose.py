@@ -37,6 +37,7 @@ from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.convention.correction import find_faults
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Model, open_model
@@ -44,6 +45,7 @@ from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import Flight, Unavailable
@@ -86,6 +88,12 @@ def diagnose(
 def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Estimate noises and time offset, re-run both filters with changes, and find faults."""
     estimates = estimate(comparison, progress)
+    convention, clock = comparison.convention, estimates.clock
+    is_late = find_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
+    if convention and is_late and isinstance(clock, ClockOffset) and clock.is_determinable:
+        # the estimate from corrected timestamps is more precise
+        convention = structs.replace(convention, late_s=-clock.offset_s)
+        comparison = replace(comparison, convention=convention)
     reruns = intervene(comparison, estimates, progress)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
@@ -153,8 +161,8 @@ def prepare_comparison(
             f"({clock.reason}).",
             "Give --clock-offset SECONDS, or omit --clock-offset.",
         )
-    low, high = clock.interval_s
-    if low <= 0.0 <= high:
+    if not clock.is_significant(clock.remaining_s):
+        low, high = clock.interval_s
         note = (
             f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
             f"{high:+.3f} s) is not significant and was not applied"
@@ -210,7 +218,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             no_position.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight.ekf2))
 
 
 def run_what_if(

@@ -43,7 +43,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SAMPLES = REPOSITORY / "sample_logs"
 LOG = SAMPLES / "aisle_uwb.ulg"
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
-REPORT_PAGES = 7
+REPORT_PAGES = 6
 SHARED = REPOSITORY.parent / "shared"
 
 # Background jobs of a shell ignore SIGINT, and processes started by tests would inherit that

@@ -44,7 +44,7 @@ def made(kind: type[T], **parts: Any) -> T:
 
 
 class StandIn:
-    """Stand-in for a record with some of its fields; properties of the record work."""
+    """Stand-in for a record with some of its fields; properties and methods of it work."""
 
     def __init__(self, kind: type, parts: dict[str, Any]) -> None:
         self.__dict__.update(parts, _kind=kind)
@@ -58,6 +58,8 @@ class StandIn:
         found = inspect.getattr_static(self.__dict__["_kind"], name)
         if isinstance(found, property):
             return found.fget(self)  # type: ignore[misc]
+        if inspect.isfunction(found):
+            return found.__get__(self)
         raise AttributeError(name)
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from cli_tools import run, run_main
 from exchange import replace
+from findings_tools import made
 from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
@@ -21,7 +22,7 @@ from px4fuse.findings import find_aids
 from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.flight.ekf2_parameters import AIDS
-from px4fuse.flight.model import AidLog, Flight, Unavailable
+from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.results.reading import read_results
 
@@ -306,3 +307,10 @@ def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None
     assert "the vehicle never took off" in str(done.exception)
     assert "px4fuse info a.ulg" in str(done.exception)
     assert not (tmp_path / "a.pdf").exists()
+
+
+def test_find_aids_reports_changes_of_the_ekf2_instance() -> None:
+    ekf2 = made(Ekf2, instances=((0.5, 0), (12.0, 1), (13.5, 0)))
+    (finding,) = find_aids({}, ekf2)
+    assert (finding.id, finding.evidence["count"]) == ("ekf2_instance_switch", 2)
+    assert not find_aids({}, made(Ekf2, instances=((0.5, 0),)))

@@ -773,8 +773,8 @@ SOURCE_EDGES = [
         {"source_low_pass": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
-          (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
-          (39.0, 0.01, None), (None, 0.001, None))),
+          (30.1, 0.001, "warning"), (30.0, 0.001, None), (40.0, 0.0133, "warning"),
+          (39.0, 0.0133, None), (None, 0.001, None))),
     (CLOCK, delayed(90.0, late(0.0, is_determinable=False)), None),
     (CLOCK, delayed(90.0, late(0.0), **REBUILT), None),
 ]  # fmt: skip
@@ -986,13 +986,13 @@ def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Tr
         (
             late(0.05, interval_s=(0.04, 0.07)),
             0.0,
-            "does not correct early timestamps",
+            "EKF2_EV_DELAY cannot be negative",
             "Correct the timestamps at the sender.",
         ),
         (
             late(-0.301, interval_s=(-0.4, -0.2)),
             0.0,
-            "PX4 allows at most 300 ms",
+            "EKF2_EV_DELAY cannot exceed 300 ms",
             "Correct the timestamps at the sender.",
         ),
         (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "300 ms late", "Check EKF2_EV_DELAY."),

@@ -10,7 +10,7 @@ import pytest
 from conftest import SAMPLES
 from exchange import replace
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Flight
@@ -54,7 +54,7 @@ def outcome(request: ComparisonRequest) -> str:
         prepared = prepare_comparison(request, flight=flight)
     except Px4FuseError as error:
         return str(error)
-    compared, source = compare(prepared), prepared.source
+    compared, source = compare(prepared, run_kf(prepared)), prepared.source
     numbers = {
         name: (axis.direction, axis.filters["kf"].nis_mean) for name, axis in compared.axes.items()
     }

@@ -159,6 +159,9 @@ def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> 
     def estimated(analysis: Analysis) -> dict[str, float]:
         return ml_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
 
+    assert estimated(sample) == {}  # 0.1 m is within the interval
+    settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.3}
+    model = replace(model, inputs=replace(model.inputs, settings=settings))
     assert estimated(sample) == {"EKF2_EVP_NOISE": 0.098}
     assert estimated(replace(sample, tuning={})) == {}
     aisle = {"aisle": sample.tuning["horizontal"]}  # --axis aisle
@@ -180,12 +183,12 @@ def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> 
 
 def test_ekf2_noise_action_for_reported_variance_sets_noise_mode(sample: Analysis) -> None:
     model = sample.ekf2_model
-    assert noise_used_m(model) == pytest.approx(0.1)
-    flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
+    assert noise_used_m(model.inputs) == pytest.approx(0.1)
+    flown = model.inputs.aid, model.inputs.settings, noise_used_m(model.inputs)
     assert remedies.noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
-    used = reported.inputs.aid, settings, noise_used_m(reported)
+    used = reported.inputs.aid, settings, noise_used_m(reported.inputs)
     assert remedies.noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
     assert remedies.noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
     assert remedies.delay_change(model.inputs, -40.0) == {}

@@ -256,12 +256,10 @@ def _make_actions(
             is_default = ("kf", "defaults") in by_kind and kind == "noises"
             defaults = by_kind["kf", "defaults"].change if is_default else {}
             actions.append(run_again(request, trial.change, defaults))
-        elif (
-            filter_name == "ekf2"
-            and kind not in ("delay", "time offset")
-            and trial.change.keys() <= PARAMETERS.keys()
-        ):
-            actions.append(set_parameters(analysis, trial.change))
+        elif filter_name == "ekf2" and kind != "delay":
+            # with corrected timestamps EKF2 may need a longer fusion horizon
+            parameters = {n: value for n, value in trial.change.items() if n in PARAMETERS}
+            actions += [set_parameters(analysis, parameters)] if parameters else []
     # actions on KF are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}

@@ -9,7 +9,7 @@ import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
-from px4fuse.comparison.remedy import ml_delay_change, noise_change
+from px4fuse.comparison.remedy import horizon_change, ml_delay_change, ml_noise_change
 from px4fuse.comparison.trials import (
     ACCOMPANYING_CHANGES,
     CLOCK_OFFSET,
@@ -85,7 +85,7 @@ def candidate_changes(
     if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
         changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
     delay = {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
-    changes += [delay] if delay else _time_offset(comparison, estimates, inputs)
+    changes += [delay] if delay else _time_offset(estimates, inputs)
     if result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
@@ -114,7 +114,7 @@ def main_axis_changes(
     )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
-        offsets = _time_offset(comparison, estimates, inputs) if has_delay else []
+        offsets = _time_offset(estimates, inputs) if has_delay else []
         return unique_changes([*changes, *offsets])
     noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noises) > 1:
@@ -157,17 +157,21 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None
-) -> list[Change]:
-    """Return the estimated time offset, if the part that is not yet applied is significant."""
-    clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
+def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
+    """Return the estimated time offset, if the part that is not yet applied is significant.
+
+    EKF2 discards positions that are older than its fusion horizon, so it may need a longer one.
+    """
+    clock = estimates.clock
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return []
-    offset_s = applied_s + clock.remaining_s
-    unapplied_s = offset_s - (applied_s if inputs is None else 0.0)
-    is_significant = abs(unapplied_s) > clock.three_sigma_s
-    return [{CLOCK_OFFSET: round(offset_s, 3)}] if is_significant else []
+    if not clock.is_significant(clock.remaining_s if inputs is None else clock.offset_s):
+        return []
+    change = {CLOCK_OFFSET: round(clock.offset_s, 3)}
+    if inputs is not None:
+        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock.offset_s
+        change |= horizon_change(inputs.settings, age_ms)
+    return [change]
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
@@ -199,16 +203,11 @@ def _without_bias(estimates: Estimates) -> list[Change]:
 
 def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
     """Return the estimated position noise, if it differs significantly from EKF2's."""
-    aid, flown, noise = inputs.aid, inputs.settings, tuned.sigma_z
-    uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
-    reported_m2 = inputs.received.variance_m2[:, :2] * uses_reported
-    flown_m = float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
-    if (noise.low or 0.0) <= flown_m <= (noise.high or np.inf):
-        return []
-    proposed_noise_m = noise.value
-    if proposed_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
-        proposed_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    return [noise_change(aid, flown, flown_m, proposed_noise_m)]
+    noise_m = tuned.sigma_z.value
+    if noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+        noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+    change = ml_noise_change(inputs, tuned.sigma_z, noise_m)
+    return [change] if change else []
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:

@@ -258,7 +258,7 @@ def _step_reasons(
         steps.SAMPLES: samples_text,
         steps.TIMESTAMPS: delay_text,
         steps.NOISE: (
-            f"EKF2 uses a measurement noise of {noise_used_m(model):.2g} m ({aid.noise}), "
+            f"EKF2 uses a measurement noise of {noise_used_m(model.inputs):.2g} m ({aid.noise}), "
             f"KF {settings.sigma_z_m:.2g} m"
         ),
         steps.BIASES: "EKF2 estimates the accelerometer bias; KF does not",

@@ -27,9 +27,14 @@ from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.signals import AISLE, Axis
-from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
+from px4fuse.filter.time_offset import (
+    MAX_HALF_INTERVAL_S,
+    MIN_CHANGE_S,
+    ClockOffset,
+    estimate_time_offset,
+)
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
-from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
@@ -40,8 +45,6 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
-MIN_CHANGE_S = 0.10
 # Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2
 
@@ -224,6 +227,7 @@ def _fit_source_errors(
         sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
+        announced_s=reset_times_s(comparison.source).tolist(),
     )
     jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
     # the exact time of a jump is unknown, so measurements just after the jump are excluded
@@ -247,7 +251,7 @@ def _fit_source_errors(
     known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
     if len(known_truths) == len(axes):
         correlated_noise = fit_time_correlation_to_truth(
-            axes, known_truths, excluded_s, offset_s, jumps, correlated_noise
+            axes, known_truths, excluded_s, offset_s, jumps, correlated_noise, low_pass
         )
     return fit, low_pass, correlated_noise
 

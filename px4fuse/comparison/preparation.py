@@ -15,7 +15,15 @@ from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    join_flights,
+)
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
@@ -300,8 +308,16 @@ def choose_segment(
     elif not flight.airborne:
         reason = "whole duration of the source (the vehicle never took off)"
     else:
-        low, high = flight.airborne[0][0], flight.airborne[-1][1]
+        flights = join_flights(flight.airborne)
+        low, high = max(flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s))
         reason = "source available and vehicle airborne"
+        if len(flights) > 1:
+            others = ", ".join(
+                f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
+                for start, end in flights
+                if start != low
+            )
+            reason += f"; longest of {len(flights)} flights, the others are {others}"
         if not max(low, first_s) < min(high, last_s):
             low, high = min(low, first_s), max(high, last_s)
             reason = "whole duration of the source (no positions in flight)"

@@ -11,14 +11,10 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of √R and EKF2_EVP_NOISE for an R that the sender reports
-MIN_REPORTED_RATIO = 1.25
-# Prediction step (ms) of EKF2 (EKF2_PREDICT_US)
-PREDICTION_STEP_MS = 10.0
 # Transmission time (ms) of a position message
 TRANSMISSION_MS = 30.0
 # Step (ms) to which EKF2_DELAY_MAX is rounded up
@@ -45,19 +41,21 @@ def ml_ekf2_parameters(
     -------
     dict
         Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is included
-        only if the flown value is outside its 95 % interval. For GNSS and drifting sources the
-        noise is included only if EKF2 uses a smaller one: innovations do not show slow errors.
+        only if the flown value differs significantly, and the noise only if it is outside its 95 %
+        interval. For GNSS and drifting sources the noise is included only if EKF2 uses a smaller
+        one: innovations do not show slow errors.
     """
     if not is_fused_source(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
+    inputs = model.inputs
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
-    used_m = noise_used_m(model)
-    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
-    if noise_m is not None and not (has_slow_errors and noise_m <= used_m):
-        changes |= noise_change(model.inputs.aid, model.inputs.settings, used_m, noise_m)
-    return changes | ml_delay_change(comparison, model.inputs, clock)
+    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
+    min_noise_m = noise_used_m(inputs) if has_slow_errors else 0.0
+    if axis_tuning and noise_m and noise_m > min_noise_m:
+        changes |= ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
+    return changes | ml_delay_change(comparison, inputs, clock)
 
 
 def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
@@ -72,11 +70,21 @@ def ml_delay_change(
     """Return the estimated delay parameter of EKF2, if it differs significantly."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
-    age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
-    high, low = (1e3 * (age_s - offset_s) for offset_s in clock.interval_s)
-    if low - PREDICTION_STEP_MS <= flown <= high + PREDICTION_STEP_MS:
-        return {}
-    return delay_change(inputs, 1e3 * (age_s - clock.offset_s))
+    ml_delay_ms = wrong_delay_ms(comparison, clock, inputs.settings[inputs.aid.delay])
+    return {} if ml_delay_ms is None else delay_change(inputs, ml_delay_ms)
+
+
+def wrong_delay_ms(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> float | None:
+    """Return EKF2's maximum-likelihood delay (ms) if the flown one differs significantly."""
+    ml_delay_ms = 1e3 * (comparison.source.age_s - clock.offset_s)
+    return ml_delay_ms if clock.is_significant(1e-3 * (flown_ms - ml_delay_ms)) else None
+
+
+def delay_limit(name: str, ml_delay_ms: float, flown_ms: float) -> str:
+    """Return the limit of PX4 that a delay violates, for example "exceed 300 ms"."""
+    if ml_delay_ms > (maximum_ms := PARAMETERS[name].maximum):
+        return f"exceed {maximum_ms:g} ms"
+    return "be negative" if round(ml_delay_ms) <= 0.0 == flown_ms else ""
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
@@ -90,7 +98,7 @@ def delay_ms(comparison: Comparison) -> float | None:
     None if the parameter is not logged or EKF2 does not use it.
     """
     source = comparison.source
-    if source.origin.aid is None:
+    if source.origin.aid is None or source.alignment is not None:
         return None
     parameter_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
     return (
@@ -100,17 +108,23 @@ def delay_ms(comparison: Comparison) -> float | None:
     )
 
 
+def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str, float]:
+    """Return EKF2's parameters for ``noise_m`` if the estimate excludes the flown noise."""
+    if (estimate.low or 0.0) <= noise_used_m(inputs) <= (estimate.high or math.inf):
+        return {}
+    return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
+
+
 def noise_change(
-    aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
+    aid: Aid, settings: Mapping[str, float], reported_m: float, noise_m: float
 ) -> dict[str, float]:
     """Return the EKF2 parameters for a position noise ``noise_m``.
 
-    ``settings`` and ``used_m`` (median √R) are the parameters and the noise as flown.
+    ``settings`` are the parameters as flown; ``reported_m`` is the noise (σ) that the sender
+    reports, which EKF2_EVP_NOISE does not reduce.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
-    is_reported = used_m > MIN_REPORTED_RATIO * settings.get(aid.noise, math.inf)
-    may_differ = aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0
-    if may_differ and is_reported and noise_m < used_m:
+    if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_m:
         changes[aid.noise_mode] = 1.0
     return changes
 
@@ -125,17 +139,27 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
     if delay_ms > parameter.maximum or inputs.received.uses_sender_times:
         return {}
     changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
-    needed_ms, flown = changes[delay] + TRANSMISSION_MS, inputs.settings
-    if not inputs.rules.uses_delay_as_horizon and needed_ms > flown["EKF2_DELAY_MAX"]:
-        changes["EKF2_DELAY_MAX"] = DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)
-    return {name: value for name, value in changes.items() if value != flown[name]}
+    changes |= horizon_change(inputs.settings, changes[delay])
+    return {name: value for name, value in changes.items() if value != inputs.settings[name]}
 
 
-def noise_used_m(model: Model) -> float:
+def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
+    """Return the EKF2_DELAY_MAX (from PX4 v1.14) for positions of this age, if it is too short."""
+    needed_ms = age_ms + TRANSMISSION_MS
+    if needed_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
+        return {}
+    return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)}
+
+
+def noise_used_m(inputs: Inputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
-    updates = model.flown.updates
-    columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
-    return float(np.sqrt(np.median(updates[columns].to_numpy())))
+    aid, flown = inputs.aid, inputs.settings
+    is_fixed = aid.noise_mode and flown[aid.noise_mode] == 1.0
+    return max(flown[aid.noise], 0.0 if is_fixed else _reported_noise_m(inputs))
+
+
+def _reported_noise_m(inputs: Inputs) -> float:
+    return float(np.sqrt(np.median(inputs.received.variance_m2[:, :2])))
 
 
 def format_settings(changes: Mapping[str, float]) -> str:

@@ -19,7 +19,7 @@ from px4fuse.trajectory.scores import autocorrelation_time
 # Minimum lever arm (m) for a finding: twice the noise of good UWB
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
-MIN_ARM_SIGMAS = 4.0
+MIN_ARM_SIGMAS = 2.5
 # Minimum lever arm (m) and minimum lever arm in σ for a finding from ground truth
 MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS = 0.05, 5.0
 # Maximum lever arm (m) for a finding: a larger one is an error of the frame

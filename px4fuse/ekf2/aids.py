@@ -15,7 +15,7 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
-from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
+from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, step_values_at
 
 AidVerdict = Literal[
     "consistent",
@@ -168,8 +168,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
         return 0.0, flight.log.duration_s
     if not flight.airborne:
         return Unavailable("EKF2 aids", "the vehicle never took off", "Record a flight.")
-    start = flight.airborne[0][0]
-    end = flight.airborne[-1][1]
+    start, end = longest_flight(flight.airborne)
     # the barometer, because the height of EKF2 may be the fault
     if flight.barometer is not None:
         down = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
@@ -337,7 +336,8 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 def _longest_gap(
     times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    ends = np.r_[start_s, times[is_fused], end_s]
+    is_inside = (log.unjudged_s > start_s) & (log.unjudged_s < end_s)
+    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unjudged_s[is_inside])
     starts = ends[:-1]
     is_enabled = np.ones(len(starts), bool)
     if log.enabled is not None:

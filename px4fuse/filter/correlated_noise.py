@@ -58,6 +58,8 @@ COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENTS = 1000
 # Minimum gain of log-likelihood over white noise in the coarse search: below, there is no full fit
 MIN_COARSE_GAIN_NATS = 0.5
+# Maximum noise (m) of positions that are so smooth that a low pass is fitted in any case
+MAX_SMOOTH_SIGMA_M = 0.01
 # Minimum gain of log-likelihood over white noise in the full fit
 MIN_GAIN_NATS = 2.0
 # Penalty on the log-likelihood of time-correlated noise with a time offset, compared with a low
@@ -227,7 +229,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     )
     label = "time-correlated noise of the source"
     no_correlation = Unavailable(label, "its errors are not time-correlated", "")
-    if white_score - correlated_score < MIN_COARSE_GAIN_NATS:
+    is_smooth = sigma_z_m < MAX_SMOOTH_SIGMA_M
+    if white_score - correlated_score < MIN_COARSE_GAIN_NATS and not is_smooth:
         return low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
@@ -239,8 +242,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     white_full_score = white_fit.lowest_score
     correlated_score = correlated_fit.lowest_score
     # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
-    # if time-correlated noise is significant
-    if white_full_score - correlated_score < MIN_GAIN_NATS:
+    # if time-correlated noise is significant, or the positions are too smooth for white noise
+    is_correlated = white_full_score - correlated_score >= MIN_GAIN_NATS
+    if not (is_correlated or is_smooth):
         return low_pass, no_correlation
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
@@ -264,6 +268,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         low_pass = SourceLowPass(
             correlation, lag_s, white_full_score - score, filtered_noises.sigma_z_m
         )
+    if not is_correlated:
+        return low_pass, no_correlation
     fitted_noises = correlated_fit.noises
     return low_pass, TimeCorrelatedNoise(
         fitted_noises.tau_s,
@@ -283,6 +289,7 @@ def fit_time_correlation_to_truth(
     clock_offset_s: float,
     jumps: Sequence[Jump],
     imu_fit: TimeCorrelatedNoise | Unavailable,
+    low_pass: SourceLowPass,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
@@ -294,11 +301,11 @@ def fit_time_correlation_to_truth(
         See :func:`fit_time_correlation`.
     truths : sequence of DataFrame
         Ground truth with the column ``position_m``, along each axis.
-    imu_fit : TimeCorrelatedNoise or Unavailable
-        Result of :func:`fit_time_correlation`; its ``lag_nats`` is copied to the result.
+    imu_fit, low_pass
+        Results of :func:`fit_time_correlation`, with the ``lag_nats`` of the result.
     """
     min_gain = MIN_TRUTH_GAIN_NATS
-    lag_nats = 0.0
+    lag_nats = low_pass.gain_nats
     if isinstance(imu_fit, TimeCorrelatedNoise):
         min_gain = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
         lag_nats = imu_fit.lag_nats

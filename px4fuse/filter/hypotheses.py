@@ -15,7 +15,7 @@ A scale factor also multiplies the noise of the acceleration, which would bias t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -154,6 +154,7 @@ def fit_bias_scale_jumps(
     sigma_z_m: float,
     outlier_time_s: Array,
     clock_offset_s: float,
+    announced_s: Sequence[float] = (),
 ) -> BiasScaleJumpFit | Unavailable:
     """Estimate accelerometer biases and scale factor error, and detect jumps of the source.
 
@@ -170,6 +171,8 @@ def fit_bias_scale_jumps(
         Timestamps of measurements to exclude.
     clock_offset_s : float
         Time offset added to the timestamps.
+    announced_s : sequence of float
+        Timestamps of announced jumps (``reset_counter``).
 
     Returns
     -------
@@ -183,7 +186,9 @@ def fit_bias_scale_jumps(
         return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
     sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    jumps, is_skipped = _find_jumps(design, sigma_a, is_skipped)
+    jumps, is_skipped = _find_jumps(
+        design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in announced_s]
+    )
     if jumps:
         design = replace(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
@@ -235,16 +240,22 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
 
 
 def _find_jumps(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, announced_s: Sequence[float]
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Tested times are the best of a scan over all times, and the starts of runs of outliers: the
-    first measurements after a jump look like outliers. Each time is tested without the measurements
-    of the next second, so that a burst of outliers is not detected as a jump. The exact time is
-    determined last, because the length of the jump depends on it.
+    Tested times are announced ones, the best of a scan over all times, and the starts of runs of
+    outliers: the first measurements after a jump look like outliers. Each time is tested without
+    the measurements of the next second, so that a burst of outliers is not detected as a jump. The
+    exact time is determined last, because the length of the jump depends on it.
     """
     jumps: list[Jump] = []
+
+    def skip_near(jump_s: float) -> BoolArray:
+        if jump_s in announced_s:  # the data after the jump are no burst of outliers
+            return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIERS_AFTER_STEP_S)
+        return is_skipped | _is_in_window(design.time_s, jump_s, OUTLIER_BURST_S)
+
     for _ in range(MAX_JUMPS):
         design = replace(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
@@ -253,6 +264,7 @@ def _find_jumps(
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         jump_times = [
+            *announced_s,
             *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
             *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
@@ -260,13 +272,14 @@ def _find_jumps(
         significant_jumps = [
             jump
             for time_s in jump_times
-            if (jump := _test_step(design, sigma_a, is_skipped, time_s, false_alarm_p)) is not None
+            if (jump := _test_step(design, sigma_a, skip_near(time_s), time_s, false_alarm_p))
         ]
         if not significant_jumps:
             break
         best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
         best_jump, is_skipped = _locate_jump(design, sigma_a, is_skipped, best_jump)
         jumps.append(best_jump)
+        announced_s = [t for t in announced_s if abs(t - best_jump.time_s) > OUTLIER_BURST_S]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
 
@@ -347,16 +360,15 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Test a jump without the data of the next second; return None if it is not significant."""
-    is_skipped_with_burst = is_skipped | _is_in_window(design.time_s, time_s, OUTLIER_BURST_S)
+    """Test a jump without the skipped data; return None if it is not significant."""
     design, columns = design.with_step(time_s)
-    count_before = np.count_nonzero(~is_skipped_with_burst & (design.time_s < time_s))
+    count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
-        min(count_before, np.count_nonzero(~is_skipped_with_burst & (design.time_s >= time_s)))
+        min(count_before, np.count_nonzero(~is_skipped & (design.time_s >= time_s)))
         < MIN_SIDE_MEASUREMENTS
     ):
         return None
-    design_fit = design.fit(sigma_a, is_skipped_with_burst)
+    design_fit = design.fit(sigma_a, is_skipped)
     size = design_fit.coefficients[columns]
     covariance = design_fit.covariance[np.ix_(columns, columns)]
     size = size / design_fit.axis_rms

@@ -53,8 +53,11 @@ MAX_HALF_INTERVAL_S = 0.15
 MAX_PART_SIGMA_S = 0.15
 # Maximum p-value of the hypothesis "constant time offset" for reporting a change in flight
 MAX_CHANGE_P = 0.005
-# Minimum significant time offset, in σ: false alarm probability 0.3 %
-MIN_OFFSET_SIGMAS = 3.0
+# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
+MIN_CHANGE_S = 0.10
+# Minimum significant time offset, in σ (false alarm probability 0.3 %), and in s: at 1 m/s a third
+# of the noise of good UWB (0.1 m)
+MIN_OFFSET_SIGMAS, MIN_OFFSET_S = 3.0, 0.03
 # Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
 # Step of ln σ for numerical derivatives of the likelihood with respect to the noises
@@ -119,6 +122,17 @@ class Clock(Record, frozen=True, kw_only=True):
     def three_sigma_s(self) -> float:
         """Minimum significant offset: ``MIN_OFFSET_SIGMAS`` standard deviations (s)."""
         return MIN_OFFSET_SIGMAS * self.sigma_s
+
+    @property
+    def changes(self) -> bool:
+        """True if the offset changes in flight: significantly, and by ``MIN_CHANGE_S``."""
+        if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P:
+            return False
+        return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S
+
+    def is_significant(self, offset_s: float) -> bool:
+        """Return True if an offset is larger than the error of the estimate and MIN_OFFSET_S."""
+        return abs(offset_s) > max(MIN_OFFSET_S, self.three_sigma_s)
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):

@@ -37,6 +37,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, group_by_root
+from px4fuse.flight.model import Ekf2
 from px4fuse.loop.model import Loop
 
 __all__ = [
@@ -87,9 +88,13 @@ def find_loop(loop: Loop) -> tuple[Finding, ...]:
     return group_by_cause(loops.detect_in_loop(loop))
 
 
-def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
-    """Return the findings about EKF2's aiding sources, for a flight without position source."""
-    return group_by_cause(aids.detect_in_aids(results))
+def find_aids(results: Mapping[str, AidResult], ekf2: object = None) -> tuple[Finding, ...]:
+    """Return the findings about EKF2 and its aids, for a flight without position source."""
+    findings = list(aids.detect_in_aids(results))
+    if isinstance(ekf2, Ekf2):  # the first entry is the instance at the start
+        span_s = ekf2.instances[0][0], ekf2.instances[-1][0]
+        findings += ekf2_resets.detect_instance_switches(ekf2, span_s)
+    return group_by_cause(findings)
 
 
 def finding_title(finding: str) -> str:

@@ -5,6 +5,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.comparison.projection import continuous_state
+from px4fuse.core.record import Span
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
 from px4fuse.flight.model import Ekf2, Reset
@@ -52,7 +53,12 @@ def detect(analysis: Analysis) -> Findings:
             },
             zero_length_spans(reset.time_s for reset in counted),
         )
-    switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
+    yield from detect_instance_switches(ekf2, (segment.start_s, segment.end_s))
+
+
+def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
+    """Detect changes of the primary EKF2 instance in a time span (s)."""
+    switches = [time for time, _ in ekf2.instances if span_s[0] < time <= span_s[1]]
     if switches:
         yield warning(
             "ekf2_instance_switch",

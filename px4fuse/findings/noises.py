@@ -60,6 +60,8 @@ MIN_LAG1_AUTOCORRELATION = 0.3
 MIN_SIGMA_RATIO_ERROR = 2.0
 # Maximum ratio of two estimates of the same noise: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
+# Minimum ratio of √R and EKF2_EVP_NOISE for an R that the sender reports
+MIN_REPORTED_RATIO = 1.25
 # Actions for an inconsistent filter whose cause no re-run shows
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
@@ -404,7 +406,9 @@ def _remedy_without_replay(
     noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
     ratio = ekf2_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_m
     if ratio > NOISE_RATIO_TOLERANCE:
-        changes = noise_change(aid, analysis.flight.log.parameters, ekf2_m, noise_m)
+        parameters = analysis.flight.log.parameters
+        is_reported = ekf2_m > MIN_REPORTED_RATIO * parameters.get(aid.noise, np.inf)
+        changes = noise_change(aid, parameters, ekf2_m * is_reported, noise_m)
         return (
             f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay of this log "
             "confirms it: fly again and compare."

@@ -6,14 +6,12 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
-from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
+from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
 
-# Minimum time offset (s) for a warning: at 1 m/s a third of the noise of good UWB (0.1 m)
-MIN_OFFSET_S = 0.03
 # Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10
 # Maximum ratio of KF's position RMSE after and before the correction of a real time offset
@@ -35,7 +33,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
-    if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
+    if clock.changes and clock.change_p_value is not None:
         start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
@@ -50,7 +48,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     size_s = abs(clock.remaining_s)
     # one offset cannot correct timestamps that are arrival times in part of the flight
     if (
-        size_s <= max(MIN_OFFSET_S, clock.three_sigma_s)
+        not clock.is_significant(clock.remaining_s)
         or find_synchronisation(analysis) is not None
         or _rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
@@ -104,7 +102,10 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
         return f"Run again with --clock-offset {option_s:.3f}."
     size_s = abs(clock.remaining_s)
     verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
-    return f"{verb} the timestamp (usec) of each position."
+    age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
+    horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
+    also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
+    return f"{verb} the timestamp (usec) of each position{also}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -118,13 +119,10 @@ def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     """Detect an EKF2_EV_DELAY that differs from the estimated delay."""
-    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY. EKF2 did not fuse a
-    # position file, and its clock is aligned with EKF2's position.
-    is_fused = analysis.source.origin.is_vision and analysis.source.alignment is None
-    delay_ms = remedy.delay_ms(analysis) if is_fused else None
+    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY.
+    delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
-    tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
-    if delay_ms is None or abs(delay_ms - ml_delay_ms) < tolerance_ms:
+    if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
     low, high, size = round(low_ms), round(high_ms), round(abs(ml_delay_ms))
@@ -134,33 +132,24 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
         estimate, low, high = f"the timestamps are {size} ms early", -high, -low
     else:
         estimate = f"the positions are {size} ms late"
-    wanted_ms = 0.0 if low_ms <= 0.0 else ml_delay_ms
+    limit = remedy.delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {estimate}. The 95 % interval is {low} to {high} "
         "ms. EKF2 fuses each position at the wrong time, so its track leads or lags."
-        f"{_format_delay_limit(wanted_ms, delay_ms)}",
-        _delay_remedy(analysis, wanted_ms, delay_ms),
+        f"{f' EKF2_EV_DELAY cannot {limit}.' if limit else ''}",
+        CORRECT_AT_SENDER if limit else _delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
     )
 
 
-def _format_delay_limit(wanted_ms: float, delay_ms: float) -> str:
-    maximum_ms = PARAMETERS["EKF2_EV_DELAY"].maximum
-    if wanted_ms > maximum_ms:
-        return f" PX4 allows at most {maximum_ms:g} ms."
-    if round(wanted_ms) <= 0.0 and delay_ms == 0.0:
-        return " EKF2_EV_DELAY cannot be negative, so it does not correct early timestamps."
-    return ""
-
-
-def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
+def _delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
-    if _format_delay_limit(wanted_ms, delay_ms) or (trial is not None and not _improves(trial)):
-        return CORRECT_AT_SENDER
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    return f"Set EKF2_EV_DELAY to {trial.change['EKF2_EV_DELAY']:g} ms."
+    if not _improves(trial):
+        return CORRECT_AT_SENDER
+    return f"Set {remedy.format_settings(trial.change)}."
 
 
 def _improves(trial: Trial) -> bool:

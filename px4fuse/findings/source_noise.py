@@ -19,6 +19,8 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
 
+# Minimum ratio of the white noise to the time-correlated error for the white noise to be a fault
+MIN_WHITE_SHARE = 0.3
 # Minimum gain of the log likelihood for time-correlated noise: 1 of 400 flights without a fault
 # exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
@@ -62,7 +64,8 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    if (ratio := noise.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
+    ratio = noise.white_m / float(np.nanmin(assumed_m))
+    if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_SHARE * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
     action = "Check multipath, anchor geometry and filters in the sender."
     if is_gnss:

@@ -33,7 +33,7 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Unavailable, positions_of, reset_times_s, source_name
 from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions, from 5 to 95 %, for a vehicle that moves
@@ -181,7 +181,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
-    reset_s = _reset_times(analysis)
+    reset_s = reset_times_s(analysis.source)
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
@@ -205,12 +205,6 @@ def detect_jumps(analysis: Analysis) -> Findings:
             evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
-
-
-def _reset_times(analysis: Analysis) -> Array:
-    """Return the times (s) at which ``reset_counter`` changes."""
-    counter = analysis.source.status.get("reset_counter", pd.Series(dtype=float))
-    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:

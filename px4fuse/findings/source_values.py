@@ -148,7 +148,10 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     values = [known + excess for known, excess in zip(source.lever_arm_m, arm[:2], strict=False)]
     parameters = aid_of(analysis).lever_arm
     change = {name: round(value, 2) for name, value in zip(parameters, values, strict=False)}
-    sensor = "sensor" if source.origin.kind == "file" else f"{source_name(source)} sensor"
+    sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
+    if source.alignment is not None:  # EKF2 did not fuse the file
+        sensor = "sensor"
+        action = "Subtract it, rotated by the attitude, from the positions of the file."
     yield warning(
         "source_lever_arm",
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
@@ -156,7 +159,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
         f"lever arm. {_replayed_effect(analysis, change)}Estimates from the positions are left "
         "out.",
-        f"Set {format_settings(change)}. Measure the position of the sensor relative to the IMU.",
+        f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 

@@ -38,6 +38,8 @@ Spans = tuple[Span, ...]
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+# Minimum time (s) on the ground between two flights: the land detector may report short landings
+MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
@@ -258,6 +260,12 @@ def source_name(source: PositionTrack) -> str:
     return SOURCE_NAMES[source.origin.kind]
 
 
+def reset_times_s(track: PositionTrack) -> Array:
+    """Return the times at which ``reset_counter`` of the source changes."""
+    counter = track.status.get("reset_counter", pd.Series(dtype=float))
+    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
+
+
 def positions_of(source: PositionTrack) -> str:
     """Return the noun phrase for the positions of a source: "UWB positions"."""
     if source.origin.kind == "file":
@@ -397,6 +405,8 @@ class AidLog:
         EKF2 parameters of the aid at the start of the log, by PX4 name.
     excluded_count : int
         Number of innovations that were dropped because no variance is near in time.
+    unjudged_s : ndarray
+        Times (s) of rows in older topics from which it is unknown whether EKF2 fused the aid.
     """
 
     topics: tuple[str, ...]
@@ -405,6 +415,7 @@ class AidLog:
     enabled: pd.Series[float] | None
     parameters: Mapping[str, float] = field(default_factory=dict)
     excluded_count: int = 0
+    unjudged_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
@@ -574,6 +585,22 @@ class Flight:
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
+
+
+def join_flights(airborne: Spans) -> Spans:
+    """Return start and end (s) of each flight; shorter landings do not separate flights."""
+    flights: list[Span] = []
+    for start_s, end_s in airborne:
+        if flights and start_s - flights[-1][1] < MIN_LANDED_S:
+            flights[-1] = (flights[-1][0], end_s)
+        else:
+            flights.append((start_s, end_s))
+    return tuple(flights)
+
+
+def longest_flight(airborne: Spans) -> Span:
+    """Return start and end (s) of the longest flight."""
+    return max(join_flights(airborne), key=lambda span: span[1] - span[0])
 
 
 def time_index(time_s: NDArray[Any]) -> pd.Index[float]:

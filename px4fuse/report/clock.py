@@ -2,17 +2,13 @@
 
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import aid_of, delay_ms
+from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
 from px4fuse.convention.correction import find_faults
-from px4fuse.core.text import format_p_value
-from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
-from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, LINES, Axes
@@ -22,8 +18,6 @@ CURVE_HEIGHT = 170.0  # height (points) of the axes
 MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
 # Maximum distance of a drawn time offset from the estimate, in half widths of its 95 % interval
 CURVE_HALF_WIDTH = 2.5
-# Maximum time offset (s) without a recommended action: one EKF2 step (EKF2_PREDICT_US)
-NEGLIGIBLE_OFFSET_S = 0.010
 # Ids of findings on the time offset; with one of them the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
@@ -61,34 +55,16 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             "position source."
         ),
     }
-    if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_OFFSET_S):
+    if clock.is_significant(offset):
         side = "late" if offset < 0.0 else "early"
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
         typed_offset = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
-    delay_name, age_s = aid_of(comparison).delay, comparison.source.age_s
-    if (configured_delay_ms := delay_ms(comparison)) is not None:
-        ml_delay_ms, min_ms, max_ms = (1e3 * (age_s - s) for s in (offset, high, low))
-        largest_ms, tolerance_ms = PARAMETERS[delay_name].maximum, 1e3 * NEGLIGIBLE_OFFSET_S
-        if min_ms - tolerance_ms <= configured_delay_ms <= max_ms + tolerance_ms:
-            advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
-        elif max_ms < 0.0 or min_ms > largest_ms:
-            advice["PX4"] = (
-                f"The maximum-likelihood {delay_name} is {ml_delay_ms:.0f} ms, but PX4 allows 0 to "
-                f"{largest_ms:g} ms. Correct the sender's clock."
-            )
-        else:
-            best_ms, min_ms, max_ms = np.clip((ml_delay_ms, min_ms, max_ms), 0.0, largest_ms)
-            advice["PX4"] = (
-                f"Set {delay_name} to {best_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
-                f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
-            )
-    if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
+    if (flown_ms := delay_ms(comparison)) is not None:
+        advice["PX4"] = _delay_advice(comparison, clock, flown_ms)
+    if clock.changes:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
-        advice["Changes"] = (
-            f"The offset changes during the flight ({format_p_value(clock.change_p_value)}): "
-            f"{offset_texts}."
-        )
+        advice["Changes"] = f"The offset changes during the flight: {offset_texts}."
     source = comparison.source
     if drift := find_faults(comparison.convention, comparison.flight, source.frame).clock_drift:
         advice["Drift"] = (
@@ -103,6 +79,22 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"(95 %){note}."
         )
     return advice
+
+
+def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
+    """Format the action for EKF2's delay parameter of the position source."""
+    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
+    if ml_delay_ms is None:
+        return f"{name} {flown_ms:g} ms agrees with the estimate."
+    if limit := delay_limit(name, ml_delay_ms, flown_ms):
+        return (
+            f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot {limit}. "
+            "Correct the sender's clock."
+        )
+    return (
+        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or correct the "
+        "sender's clock."
+    )
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:

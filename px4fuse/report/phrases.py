@@ -12,11 +12,13 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UntestedFilter,
 )
+from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
+from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.log import ClockMap
 from px4fuse.flight.model import Alignment, Truth, Unavailable
 from px4fuse.report.page import styled_text
@@ -236,9 +238,12 @@ def tuning_advice(
             "noise between samples. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
-        px4_value = log.parameters.get("EKF2_EVP_NOISE")
-        current_value = "" if px4_value is None else f" (now {px4_value:g} m)"
-        advice["PX4"] = f"Set EKF2_EVP_NOISE to {sigma_z.value:.3g} m{current_value}."
+        flown_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
+        noise_m = noise_change(EV_POS, log.parameters, 0.0, sigma_z.value)[name]
+        current_value = "" if flown_m is None else f" (now {flown_m:g} m)"
+        advice["PX4"] = f"Set {name} to {noise_m:g} m{current_value}."
+        if flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (sigma_z.high or 0.0):
+            advice["PX4"] = f"{name} {flown_m:g} m is within the 95 % interval."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
