@@ -42,6 +42,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
 from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log_name
+from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
@@ -281,6 +282,8 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
+    if is_height_only(analysis.source):
+        return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "

@@ -38,6 +38,8 @@ UNUSABLE = (
     "source_two_senders",
     "source_positions_rounded",
     "source_lever_arm",
+    "source_height_only",
+    "source_relocalises",
     "source_timestamps_shared",
 )
 # Key in Finding.evidence of the time (s) at which the source announced a jump by its reset_counter
