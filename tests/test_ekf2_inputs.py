@@ -37,6 +37,7 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
+    EV_POS,
     GNSS_POS,
     PARAMETERS,
     check_parameters,
@@ -114,7 +115,9 @@ def test_parameter_sweep_accepts_2_to_200_values():
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Return a function that prepares inputs of a flight with the given parameters."""
     monkeypatch.setattr(
-        inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=np.zeros(1))
+        inputs_module,
+        "read_vision",
+        lambda *_: ReceivedPositions(*np.zeros((6, 1)), source="vision"),
     )
     segment = made(ReplaySegment, field=None)
     monkeypatch.setattr(inputs_module, "find_replay_segments", lambda *_, **_more: (segment,))
@@ -128,8 +131,8 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
             flow=pd.DataFrame(),
         )  # fmt: skip
         ekf2 = made(
-            Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
-            step_s=0.01, fusing=fusing, aids={}, states={},
+            Ekf2, record=record, innovations={"north": pd.DataFrame({"rejected": []})},
+            horizon_s=horizon_s, step_s=0.01, fusing=fusing, aids={}, states={},
         )  # fmt: skip
         imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
         return prepare_inputs(
@@ -226,7 +229,8 @@ def test_logged_rejections_are_matched_by_measurement_time():
     stamp = 10.0 + 0.5 * np.arange(6)
     taken = stamp - 0.05 - 0.005
     off = np.array([0.0, 0.0059, -0.0059, 0.0061, -0.0061, 0.0])
-    logged = pd.DataFrame({"rejected": [1.0, 1.0, 0.0, 1.0, 1.0, 0.0]}, index=taken + off)
+    columns = {"rejected": [1.0, 1.0, 0.0, 1.0, 1.0, 0.0], "innovation_m": 1.0}
+    logged = pd.DataFrame(columns, index=taken + off)
     shown = taken + 0.1
     resets = (
         Reset(float(shown[0]) + 0.19, "position", (1.0, 0.0, 0.0)),
@@ -244,6 +248,8 @@ def test_logged_rejections_are_matched_by_measurement_time():
     rejected, reset = _logged_decisions(made(Ekf2, **parts), record, stamp)
     assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
     assert reset.tolist() == [True, False, False, False, True, False]
+    logged.loc[logged.index[5], "innovation_m"] = 0.0  # EKF2 logs a reset with innovation 0
+    assert _logged_decisions(made(Ekf2, **parts), record, stamp)[1][5]
     for other in ({"innovation_topics": ()}, {"horizon_s": NONE}, {"innovations": {"north": NONE}}):
         rejected, reset = _logged_decisions(made(Ekf2, **{**parts, **other}), record, stamp)
         assert np.isnan(rejected).all()
@@ -259,18 +265,24 @@ def test_ekf2_position_corrections_by_fusion_exclude_resets():
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
     state["north_m"], state["north_m_s"], state["east_m"] = 2.0 * times, 2.0, 3.0 * (times >= 5.0)
     reset = Reset(5.0, "position", (0.0, 3.0, 0.0))
-    measured_s, fates = np.arange(1.025, 8.0, 0.1), np.tile([0.0, np.nan, np.nan], 24)[:70]
+    stamp_s, logged = np.arange(1.075, 8.0, 0.1), np.tile([1.0, np.nan, np.nan], 24)[:70]
+    settings = {"EKF2_EV_DELAY": 50.0, "EKF2_TAU_POS": 0.25}
 
-    some = np.where(fates == 0.0, 1.0, fates)
-
-    def moved(*resets: Reset, rejected: Any = some) -> Any:
-        ekf2 = made(Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01)
-        return _position_corrections(ekf2, measured_s, rejected, 0.25)
+    def moved(*resets: Reset, rejected: Any = logged, arrival_s: Any = stamp_s) -> Any:
+        received = made(ReceivedPositions, stamp_s=stamp_s, arrival_s=arrival_s, rejected=rejected)
+        innovations = {"north": pd.DataFrame({"rejected": [np.nanmax(rejected)]})}
+        ekf2 = made(
+            Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01, innovations=innovations
+        )
+        return _position_corrections(ekf2, received, settings, EV_POS)
 
     assert_allclose(moved(reset), 0.0, atol=1e-9)
     assert np.nanmax(moved()) > 1.0
+    # a sample that arrives late is fused late
+    late = moved(arrival_s=stamp_s + 0.3)
+    assert np.nanargmax(late[:, 1]) == np.nanargmax(moved()[:, 1]) - 2
     # no correction if nothing is rejected, or all decisions are logged
-    assert moved(reset, rejected=fates) is None
+    assert moved(reset, rejected=0.0 * logged) is None
     assert moved(reset, rejected=np.ones(70)) is None
 
 
@@ -282,6 +294,8 @@ def test_ekf2_position_corrections_by_fusion_exclude_resets():
     ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count after half of the target
     ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a logged end restarts the count
     ([10] * 3, [], [1, 2, 3]),
+    # 2 of 12 samples are not logged, but EKF2 counted them
+    ([4, 4, 8, 4, 4, 4, 4, 8, 4, 4], [], [2, 3, 5, 7, 8, 10]),
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip

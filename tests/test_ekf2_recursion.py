@@ -233,8 +233,12 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
 
 
 @pytest.mark.parametrize(("north_m", "share", "fused"), [
-    (2.0, 0.6, True), (2.0, 0.4, False), (3.3, 0.6, True), (3.3, 0.4, False),
-    (1.5, 0.4, True), (4.0, 0.6, False),
+    # close to the limit, the published motion decides
+    (2.5, 1.0, True), (2.5, 0.0, False), (2.53, 1.0, True), (2.53, 0.0, False),
+    # the motion is ambiguous, or the NIS is far from the limit: the gate of the replay decides
+    (2.5, 0.4, True), (2.53, 0.6, False), (2.0, 0.0, True), (3.3, 1.0, False),
+    # beyond MAX_LOG_RATIO the motion is not used
+    (1.5, -99.0, True), (4.2, 99.0, False),
 ])  # fmt: skip
 def test_fusion_near_gate_is_derived_from_published_position(north_m, share, fused):
     """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""

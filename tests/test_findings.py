@@ -249,7 +249,8 @@ FAULTS = [
 # Findings tested in other files, with the estimates that they need
 TESTED_ELSEWHERE = {
     "accelerometer_bias", "aid_innovation_bias", "aid_innovation_shift", "aid_not_fused",
-    "aid_overconfident", "ekf2_ev_delay_wrong", "ekf2_gate_too_small", "ekf2_heading_error",
+    "aid_overconfident", "ekf2_acceleration_bad", "ekf2_ev_delay_wrong", "ekf2_gate_too_small",
+    "ekf2_heading_error",
     "ekf2_noise_too_large", "ekf2_noise_too_small", "false_loop_closure",
     "loop_closure_inconsistent", "loop_drift_too_small", "loop_landing_assumed",
     "loop_on_absolute_positions", "sigma_a_too_large", "sigma_a_too_small", "sigma_z_too_large",
@@ -262,7 +263,8 @@ TESTED_ELSEWHERE = {
     "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
-    "source_without_position",
+    "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
+    "parameter_changed", "source_height_only", "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {

@@ -1,6 +1,7 @@
 """Flights with known faults: expected findings, actions and differences KF - EKF2."""
 
 import json
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -189,3 +190,30 @@ def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, fac
     assert [finding.id for finding in behind] == behind_it
     assert behind[2].evidence["sigma_ratio"] < 0.5
     assert not [f for f in findings if f.severity == "error" and f.caused_by is None]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # a flight without a fault, with the usual short flags for a bad vertical acceleration
+        ("g1_base", {"ekf2_acceleration_bad": "note"}),
+        ("g1_v01", {"ekf2_acceleration_bad": "warning", "aid_overconfident": "warning"}),
+        # vision beside GNSS: an offset origin and EKF2_GPS_P_NOISE as minimum noise are no faults
+        ("eg1_base", {"ekf2_underconfident": "note"}),
+        ("eg1_evp20", {"ekf2_underconfident": "error"}),
+    ],
+)
+def test_findings_of_flights_in_pairs_are_as_expected(
+    shared_logs: Path, name: str, expected: dict[str, str]
+) -> None:
+    analysis = explain(compare(read_log(shared_logs / f"flown/{name}.ulg")))
+    found = {item.id: item for item in find(analysis)}
+    severities = {name: item.severity for name, item in found.items()}
+    assert severities | expected == severities
+    if "base" in name:
+        of_kf = ("kf_", "sigma_")  # SIGMA_Z is not set for GNSS here
+        assert {found[i].severity for i in found if not i.startswith(of_kf)} == {"note"}
+    if name == "g1_v01":
+        assert "EKF2_GPS_V_NOISE" in found["ekf2_acceleration_bad"].remedy
+    if name == "eg1_evp20":
+        assert "EKF2_EVP_NOISE to 0.1 m" in found["ekf2_underconfident"].remedy

@@ -154,7 +154,7 @@ def test_outdoor_flight_without_fault_is_consistent() -> None:
         ("heading=25,40", "ekf2_heading_error"),
         ("clock-offset=0.25", "source_time_offset"),
         ("ekf2-delay=0", "source_time_offset"),
-        ("r-scale=0.1", "ekf2_overconfident"),
+        ("r-scale=0.1", "ekf2_noise_too_small"),
         ("ekf2-gate=1", "ekf2_gate_too_small"),
         ("mag=0.2", "aid_innovation_shift"),
         ("slow-error=0.5,30", "source_noise_time_correlated"),

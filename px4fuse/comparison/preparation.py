@@ -88,6 +88,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
     flight, track = correct(flight, track, convention)
     track = _move_to_vehicle(track, flight)
+    track = _use_origin_of_gnss(track, flight)
     track = _use_barometer_height(track, flight, request.height)
     flight = select_innovations(flight, track)
     missing = flight.missing
@@ -190,6 +191,30 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
         "positions refer to the vehicle's origin: lever arm of the sensor "
         f"{forward:g} m forward, {right:g} m right, {down:g} m down (EKF2 "
         "parameters)"
+    )
+    return replace(track, samples=samples, notes=(*track.notes, note))
+
+
+def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
+    """Move vision positions to the origin of GNSS if EKF2 fused GNSS as well.
+
+    EKF2 then estimates the offset of vision, so an offset is not a fault.
+    """
+    ekf2 = flight.ekf2
+    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and fused_aid(ekf2)):
+        return track
+    samples = track.samples.copy()
+    offset_m = [
+        float(np.nanmedian(samples[c] - np.interp(samples.index, ekf2.state.index, ekf2.state[c])))
+        for c in Columns.POSITION
+    ]
+    if track.frame != "NED" or not np.isfinite(offset_m).all():
+        return track
+    samples[Columns.POSITION] -= offset_m
+    north, east, down = offset_m
+    note = (
+        f"the median offset of {track.name} from EKF2 ({north:.1f} m north, {east:.1f} m east, "
+        f"{down:.1f} m down) is removed, because EKF2 estimates it while it fuses GNSS"
     )
     return replace(track, samples=samples, notes=(*track.notes, note))
 

@@ -54,7 +54,7 @@ class BiasEstimator:
         time_s: Array,
         has_sample: BoolArray,
         updates_bias: BoolArray,
-        weight: float = 1.0,
+        weight: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """Return innovation and R corrected for the current bias, then update the bias.
 
@@ -64,26 +64,27 @@ class BiasEstimator:
             Innovation without the bias (m), HPH' and R (m²).
         time_s, has_sample, updates_bias : ndarray
             Per filter configuration: sample time, True with a sample, True to update the bias.
-        weight : float
-            Number of samples that EKF2 fused per logged sample.
+        weight : float or ndarray, shape (S,)
+            Number of samples that EKF2 fused per known sample.
         """
         updates_now = has_sample & updates_bias
-        density_factor = np.where(
-            np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, RANDOM_WALK_FACTOR, 1.0
+        growth_s = (time_s - self.last_s) * updates_now
+        has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
+        if has_offset.any():
+            growth_s = np.where(has_offset, RANDOM_WALK_FACTOR, 1.0) * growth_s
+        variance = np.minimum(
+            self.variance_m2 + BIAS_DENSITY**2 * growth_s, np.maximum(noise_m2, MIN_NOISE_M2)
         )
-        variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * density_factor * updates_now
-        max_variance = np.maximum(noise_m2, MIN_NOISE_M2)
-        variance = np.minimum(self.variance_m2 + variance_growth, max_variance)
         nu = nu + self.value_m
         R = noise_m2 + variance
         S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
         K = variance / S * (updates_now & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
-        self.variance_m2 = np.maximum(variance * (1.0 - K), MIN_VARIANCE_M2)
-        change = np.minimum(ratio, 1.0) * np.sign(-nu) - self.mean_signed_ratio
-        self.mean_signed_ratio = (
-            self.mean_signed_ratio + self.filter_weight * weight * updates_now * change
+        self.variance_m2 = np.maximum(variance - K * variance, MIN_VARIANCE_M2)
+        change = np.copysign(np.minimum(ratio, 1.0), nu) + self.mean_signed_ratio
+        self.mean_signed_ratio = self.mean_signed_ratio - (
+            self.filter_weight * weight * updates_now * change
         )
         self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import FusionRules, Inputs
@@ -41,9 +42,14 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 # Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0
 MIN_STATE_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
-# A position sample with NIS / gate² from 1/2 to 2 is near the gate limit. If EKF2's rejection of
-# this sample is not logged, the rejection is inferred from the published position
-GATE_EDGE_RATIO = 2.0
+# Maximum |ln(NIS / gate²)| of a position sample near the gate limit. If EKF2's rejection of this
+# sample is not logged, the rejection is inferred from the published position
+MAX_LOG_RATIO = 1.0
+# Scale of the error of ln(NIS / gate²) in the replay (logistic distribution): in flights with all
+# rejections logged, fused samples have NIS / gate² up to 1.19, rejected ones down to 0.84
+LOG_RATIO_SCALE = 0.04 / 1.7
+# Standard deviation (m) of a position correction that is estimated from the published position
+CORRECTION_SIGMA_M = 0.02
 # Number of events for which transition matrices are copied at once: more events need more memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) that is so large that the measurement has no effect
@@ -51,6 +57,18 @@ IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
+# Beginnings of the names of parameters without effect on vertical innovations: with other values of
+# these parameters the logged flag for a bad acceleration remains valid
+NO_EFFECT_ON_HEIGHT = (
+    "EKF2_EV",
+    "EKF2_MAG",
+    "EKF2_OF",
+    "EKF2_TAU",
+    "EKF2_GPS_P_GATE",
+    "EKF2_GPS_DELAY",
+)
+# σ (m/s²) of the accelerometer bias after estimation on the ground
+INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
 VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
@@ -62,7 +80,8 @@ MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
 MIN_BIAS_VARIANCE_RATIO = 0.01
 # Indices of heading error and position in the state
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
-BIAS_NORTH, BIAS_EAST = 12, 13  # state indices of the accelerometer bias, rotated to NED
+# State indices of the accelerometer bias, rotated to NED
+BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
 GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
@@ -71,7 +90,7 @@ HORIZONTAL = slice(NORTH, EAST + 1)
 # State indices of velocity and position, both of which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
 # Columns of velocity and of horizontal position in arrays of the six MEASURED_STATES
-VELOCITY_COLUMNS = slice(0, 3)
+VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
 POSITION_COLUMNS = slice(3, 5)
 
 
@@ -110,6 +129,12 @@ class FilterConfiguration:
     uses_logged_decisions: bool = False
     without: Mapping[str, float] = field(default_factory=dict)
     timestamp_offset_s: float | None = None
+
+    def has_logged_bad_acceleration(self, inputs: Inputs) -> bool:
+        """Return True if the logged flag for a bad acceleration is valid with these parameters."""
+        changed = {name for name, value in self.settings.items() if value != inputs.settings[name]}
+        has_same_heights = all(name.startswith(NO_EFFECT_ON_HEIGHT) for name in changed)
+        return self.uses_logged_decisions or (has_same_heights and not self.without)
 
     def timing(self, inputs: Inputs) -> Timing:
         """Return the age of a position at its timestamp, and the delay of the fusion horizon."""
@@ -281,12 +306,27 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             FLOW, [mean_by_event(flow, end_steps, segment.imu_velocity_m_s) for end_steps in ends]
         )
         has_flow = np.asarray(flow_samples.sample_count.any(axis=1))
+    has_logged_flag = segment.heights is None or segment.is_acceleration_bad is None
+    bad_acceleration = BadAcceleration(
+        np.array(
+            [has_logged_flag or c.has_logged_bad_acceleration(inputs) for c in configurations]
+        ),
+        inputs.rules.bad_acceleration_s,
+        segment,
+    )
     if segment.heights is not None:
         barometer = np.stack(barometer_samples(segment, ends), axis=-1)[
             ..., configuration_intervals
         ]
         heights = HeightFilter(
-            segment, barometer, event["time_s"], is_active, enabled, parameters, has_gate
+            segment,
+            barometer,
+            event["time_s"],
+            is_active,
+            enabled,
+            parameters,
+            has_gate,
+            bad_acceleration,
         )
     if inputs.vision is not None:
         vision_by_configuration = [
@@ -310,12 +350,19 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (events, 1))[
         :, :, None, None
     ]
-    if (share := segment.bad_acceleration_share) is not None:
+    if (share := segment.clipped_share) is not None:
         # fraction of accelerometer axes with BAD_ACCELERATION_NOISE, averaged over each interval
         share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
         mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
         acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
     x, P = _start_state(segment, biases, attitude)
+    if bad_acceleration.until_s[0] > segment.time_s[0]:
+        # EKF2 has not estimated the accelerometer bias, but would have with other parameters
+        has_bias = ~bad_acceleration.follows_log & biases
+        P[has_bias, BIAS_DOWN, :] = 0.0
+        P[has_bias, :, BIAS_DOWN] = 0.0
+        P[has_bias, BIAS_DOWN, BIAS_DOWN] = INITIAL_BIAS_SIGMA_M_S2**2
+        x[has_bias, BIAS_DOWN] = segment.mean_bias_down_m_s2
     logged_decisions = inputs.received.rejected[sample], inputs.received.reset[sample]
     is_aid_enabled = enabled[inputs.aid.name]
     logged_correction_m = inputs.received.correction_m if uses_logged_decisions.any() else None
@@ -339,6 +386,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     innovation, R = np.empty((2, configuration_count, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
+    start_s = np.full(configuration_count, segment.time_s[0])
     for e in range(events):
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
@@ -348,9 +396,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 "correction_input", event_batch
             )
             added_noise = gyro_variance * stacked("gyro_noise", event_batch)
-            added_noise = added_noise + acceleration_variance[event_batch] * stacked(
-                "accelerometer_noise", event_batch
-            )
+            accelerometer_noise = stacked("accelerometer_noise", event_batch)
+            added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
             variance_growth = variance_increment * steps[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q
@@ -358,6 +405,16 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
+        is_bias_constant = None
+        share = bad_acceleration.share(event_time_s[e - 1] if e else start_s, event_time_s[e])
+        if share is not None:
+            increase = share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0])
+            P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
+                increase[:, None, None] * accelerometer_noise[batch_index]
+            )
+            is_bias_constant = bad_acceleration.until_s > event_time_s[e]
+            bias_before = x[:, ACCELEROMETER_BIAS].copy()
+            bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
         if inputs.rules.min_bias_variance is not None:
@@ -375,12 +432,21 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
         if vision is not None:
             x, P = vision.fuse(e, x, P, False, fusion.last_position_s)
+        if heights is not None:
+            x, P = heights.fuse_barometer(e, x, P)
         if has_sample[e]:
             nu = measured_values[e] - x[:, MEASURED_STATES]
             S = _diagonal(P)[:, MEASURED_STATES] + noise[e]
+            is_outside_gate = nu * nu > gate_squared * S
+            if is_outside_gate[:, DOWN_COLUMN].any():
+                # EKF2 clips the vertical velocity if the horizontal velocity is inside the gate
+                is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[e])
+                is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
+                limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
+                nu[is_clipped, DOWN_COLUMN] = np.clip(nu[is_clipped, DOWN_COLUMN], -limit, limit)
+                is_outside_gate[:, DOWN_COLUMN] &= ~is_clipped
             innovations[e] = nu
             variances[e] = S
-            is_outside_gate = nu * nu > gate_squared * S
             is_velocity_fused = can_fuse_velocity[e] & ~(
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
@@ -411,7 +477,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 innovation[:, 2:] = nu[:, POSITION_COLUMNS]
                 R[is_fused[e], 2:] = noise[e, is_fused[e], POSITION_COLUMNS]
         if heights is not None:
-            x, P = heights.fuse(e, x, P, measured_values[e, :, 5], noise[e, :, 5])
+            x, P = heights.fuse_gnss(e, x, P, measured_values[e, :, 5], noise[e, :, 5])
         # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
@@ -449,6 +515,18 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             # EKF2 resets the position after a time without a fused position, from GNSS or vision
             if inputs.rules.resets_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
+        if heights is not None and bad_acceleration.models_flag:
+            ratios = heights.ratios(e)
+            if has_sample[e] and has_speed:
+                velocity_ratio = -nu[:, DOWN_COLUMN] / np.sqrt(S[:, DOWN_COLUMN])
+                velocity_ratio[~can_fuse_velocity[e]] = np.nan
+                ratios[-1] = np.fmax(ratios[-1], velocity_ratio)
+            bad_acceleration.update(event_time_s[e], ratios)
+        if is_bias_constant is not None:
+            x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before[is_bias_constant]
+            P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
+                is_bias_constant
+            ]
         states[e + 1] = x
         state_variances[e + 1] = _diagonal(P)
     innovations[~is_active] = np.nan
@@ -530,20 +608,17 @@ def _rejection_by_output(
     """Infer EKF2's rejection of a position sample from the published position.
 
     Return two masks of filter configurations: True if the sample is near the gate limit, and True
-    if EKF2 rejected the sample. A sample counts as rejected if the correction of the published
-    position (``observed_correction_m``, north and east) is less than half of the expected
-    correction, (1 - R/S)ν. The other arrays have shape (S, 2).
+    if EKF2 rejected the sample. Two likelihood ratios are combined: of the estimated correction
+    of the published position (``observed_correction_m``, north and east), whose expected value is
+    (1 - R/S)ν for a fused sample and 0 for a rejected one, and of the NIS of the replay. The other
+    arrays have shape (S, 2).
     """
     ratio = (nu * nu / (gate_squared * S)).max(axis=1)
-    is_near_gate = (
-        (ratio > 1.0 / GATE_EDGE_RATIO)
-        & (ratio < GATE_EDGE_RATIO)
-        & np.isfinite(observed_correction_m).all()
-    )
+    log_ratio = np.log(np.maximum(ratio, 1e-9))
+    is_near_gate = (np.abs(log_ratio) < MAX_LOG_RATIO) & np.isfinite(observed_correction_m).all()
     correction_m = (1.0 - R / S) * nu
-    return is_near_gate, correction_m @ observed_correction_m < 0.5 * (
-        correction_m * correction_m
-    ).sum(axis=1)
+    surplus_m2 = correction_m @ observed_correction_m - 0.5 * (correction_m**2).sum(axis=1)
+    return is_near_gate, surplus_m2 / CORRECTION_SIGMA_M**2 < log_ratio / LOG_RATIO_SCALE
 
 
 @dataclass

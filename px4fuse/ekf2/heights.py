@@ -17,6 +17,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.ekf2.bad_acceleration import BadAcceleration
+from px4fuse.ekf2.barometer import fused_samples
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
     HeightSamples,
@@ -36,10 +38,6 @@ HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # by value of EKF2_HG
 # Maximum time (s) from the start of the replay to the first logged height bias: the bias is logged
 # at 2 Hz
 MAX_BIAS_LOG_DELAY_S = 1.0
-# Rate (Hz) at which EKF2 fuses the barometer, from PX4 v1.15 on
-BAROMETER_HZ = 10.0
-# Rate (Hz) at which EKF2 fuses the barometer, before PX4 v1.15
-OLD_BAROMETER_HZ = 15.0
 # Minimum rate (Hz) of the logged barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) in EKF2
@@ -70,13 +68,16 @@ def add_heights(
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    measured_at_s, down_m = np.zeros((2, 0))
+    measured_at_s, down_m, weight = np.zeros((3, 0))
     if BAROMETER.name in fused_aids and flight.barometer is not None:
-        measured_at_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
-        down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
+        logged = flight.barometer["down_m"]
+        logged = logged.set_axis(logged.index - 0.5 * ekf2.step_s)
+        samples = fused_samples(ekf2, record, logged)
+        measured_at_s = samples.index.to_numpy()
+        down_m = samples["down_m"].to_numpy() + record.altitude_m
+        weight = samples["weight"].to_numpy()
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
-    ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
     new_segments = []
     delayed_down_m = record.delayed["down_m"]
     for segment in segments:
@@ -91,43 +92,46 @@ def add_heights(
                 return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
             value, variance = (
                 float(np.interp(start_s, logged_bias.index, logged_bias[name]))
-                for name in logged_bias
+                for name in ("bias_m", "bias_m2")
             )
             bias = value, variance
-        samples = barometer_samples_inside(segment, measured_at_s, down_m, dead_zone_m)
-        rate_hz = len(samples[0]) / float(segment.time_s[-1] - start_s)
+        columns = measured_at_s, down_m, dead_zone_m, weight
+        samples_inside = barometer_samples_inside(segment, *columns)
+        rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz"
-        weight = max(ekf2_rate_hz / rate_hz, 1.0) if rate_hz else 1.0
         state = segment.state.copy()
         state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
-        heights = HeightSamples(tuple(fused_aids), reference, bias, *samples, weight)
+        heights = HeightSamples(tuple(fused_aids), reference, bias, *samples_inside)
         new_segments.append(replace(segment, state=state, heights=heights))
     return tuple(new_segments)
 
 
 def barometer_samples_inside(
-    segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array
-) -> tuple[IntArray, Array, Array, Array]:
+    segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array, weight: Array
+) -> tuple[IntArray, Array, Array, Array, Array]:
     """Select the barometer samples inside a segment.
 
-    Return for each sample the prediction step after which it is fused, time (s), height (m, down)
-    and dead zone (m).
+    Return for each sample the prediction step after which it is fused, time (s), height (m, down),
+    dead zone (m) and weight.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
-    return step, measured_at_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
+    measured_at_s, down_m = measured_at_s[is_inside], down_m[is_inside]
+    return step, measured_at_s, down_m, dead_zone_m[is_inside], weight[is_inside]
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
     """Return the barometer samples that are fused at each event, one array per set of events.
 
-    Each element of ``ends`` contains the prediction steps of E events. Each array has shape (5, k,
+    Each element of ``ends`` contains the prediction steps of E events. Each array has shape (6, k,
     E). Its rows are height (m, down), see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`;
-    sample age (s); sample time (s); dead zone (m); and 1 for a sample. All are 0 without a sample.
+    sample age (s); sample time (s); dead zone (m); weight; and 1 for a sample. All are 0 without a
+    sample.
     """
     heights = segment.heights
     assert heights is not None
-    columns = heights.down_m[:, None], slice(2, 3), heights.measured_at_s, heights.dead_zone_m
+    more = heights.measured_at_s, heights.dead_zone_m, heights.weight
+    columns = heights.down_m[:, None], slice(2, 3), *more
     return pad_samples(
         [samples_by_event(segment, event_steps, heights.step, *columns) for event_steps in ends]
     )
@@ -139,7 +143,7 @@ class HeightFilter:
     Parameters
     ----------
     segment : ReplaySegment
-    barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
+    barometer : ndarray, shape (6, k, E, S) or (6, k, E, 1)
         Result of :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
         Measurement time of the GNSS fix of each event, and mask of the events with a fix.
@@ -148,6 +152,8 @@ class HeightFilter:
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate : ndarray of bool, shape (S,)
         True for filter configurations that apply the gate.
+    bad_acceleration : BadAcceleration
+        Flag with which innovations outside the gate are clipped and fused.
 
     Attributes
     ----------
@@ -165,23 +171,28 @@ class HeightFilter:
         enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
+        bad_acceleration: BadAcceleration,
     ) -> None:
+        self.bad_acceleration = bad_acceleration
         heights = segment.heights
         configuration_count = len(has_gate)
         assert heights is not None
         self.fused = heights.fused
-        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, is_sample = barometer
+        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
         self.time_s = [*measured_at_s, fix_s]
         self.update_log = np.full((len(fix_s), len(self.time_s), 3, configuration_count), np.nan)
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
-        self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
+        has_barometer = (is_sample > 0.0) & enabled[BAROMETER.name]
+        self.has_sample = np.concatenate(
+            [has_barometer, np.broadcast_to(has_fix, (1, *has_barometer.shape[1:]))]
+        )
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
-        self.weight = (heights.weight, 1.0)
+        self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
         self.learning = enabled[heights.reference]
         value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
         start_s = float(segment.time_s[0])
@@ -206,11 +217,8 @@ class HeightFilter:
         columns |= {"rejected": 1.0 - is_fused, "fused": is_fused, "fused_at_s": end_s}
         return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
 
-    def fuse(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
-        """Return state and covariance after fusing barometer and GNSS height at one event.
-
-        ``gnss_m`` is the GNSS height (m, down), ``gnss_m2`` its measurement variance R (m²).
-        """
+    def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
+        """Return state and covariance after fusing the barometer samples before one event."""
         for slot in range(len(self.down_m)):
             if self.any_sample[slot][e]:
                 age_s = self.age_s[slot, e]
@@ -220,11 +228,26 @@ class HeightFilter:
                 x, P = self._fuse_innovation(
                     e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
                 )
+        return x, P
+
+    def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
+        """Return state and covariance after fusing the GNSS height at one event.
+
+        ``gnss_m`` is the GNSS height (m, down), ``gnss_m2`` its measurement variance R (m²).
+        """
         if self.any_sample[-1][e]:
             column = P[:, :, DOWN]
             nu = gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
         return x, P
+
+    def ratios(self, e: int) -> Array:
+        """Return state minus measurement (down) in √S of one event, shape (k + 1, S).
+
+        The last row is GNSS height; NaN without a sample.
+        """
+        nu, S = self.update_log[e, :, 0], self.update_log[e, :, 1]
+        return np.where(self.has_sample[:, e], -nu / np.sqrt(S), np.nan)
 
     def _fuse_innovation(
         self,
@@ -239,6 +262,7 @@ class HeightFilter:
         R: Array,
     ) -> ArrayPair:
         """Fuse one height innovation ``nu``; ``column`` is PH', ``predicted_variance`` HPH'."""
+        weight = self.weight[slot][e]
         if self.biased[sensor_index]:
             nu, R = self.bias.remove_bias(
                 nu,
@@ -247,12 +271,20 @@ class HeightFilter:
                 self.time_s[slot][e],
                 self.has_sample[slot][e],
                 self.learning[e],
-                self.weight[sensor_index],
+                weight,
             )
         if sensor_index == 0 and self.in_ground_effect[slot, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = predicted_variance + R
-        is_fused = self.has_sample[slot][e] & (nu * nu <= self.gate2[sensor_index] * S)
+        has_sample = self.has_sample[slot][e]
+        is_fused = has_sample & (nu * nu <= self.gate2[sensor_index] * S)
+        if not is_fused.all():
+            is_clipped = (
+                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot][e])
+            )
+            limit = np.sqrt(self.gate2[sensor_index] * S)
+            nu = np.where(is_clipped, np.clip(nu, -limit, limit), nu)
+            is_fused |= is_clipped
         self.update_log[e, slot] = nu, S, is_fused
-        K = column * (is_fused / (predicted_variance + R / self.weight[sensor_index]))[:, None]
+        K = column * (is_fused / (predicted_variance + R / weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

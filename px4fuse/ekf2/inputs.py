@@ -108,7 +108,8 @@ class ReceivedPositions:
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
     correction_m : ndarray, shape (m, 2), or None
         EKF2's position correction by each sample (north and east), estimated from the published
-        position. None if all rejections are logged, or none occurred.
+        position. None if all rejections are logged, if none occurred, or with vision that is fused
+        in addition to GNSS.
     """
 
     stamp_s: Array
@@ -151,6 +152,8 @@ class FusionRules:
     uses_delay_as_horizon : bool
         True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
         v1.15).
+    bad_acceleration_s : float
+        Time for which EKF2's flag for a bad vertical acceleration stays set.
     """
 
     start_interval_s: float
@@ -161,6 +164,7 @@ class FusionRules:
     uses_delay_as_horizon: bool
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
+    bad_acceleration_s: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -270,6 +274,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"the log has no sample of {aid.label} while EKF2 reports its fusion",
             "Record estimator_status_flags and the position source for the whole flight.",
         )
+    position_samples = replace(
+        position_samples,
+        correction_m=_position_corrections(
+            ekf2, position_samples, effective_settings(record.parameters, aid), aid
+        ),
+    )
     vision = (
         _read_vision_besides_gnss(flight, logged_ekf2, record, attitude)
         if is_gnss and EV_POS.name not in doubtful_aids
@@ -380,6 +390,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             is_horizon_from_delay,
             reset_variance_factor,
             resets_together,
+            bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
     # times: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
@@ -444,33 +455,34 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     fuses_velocity = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
     velocity_variance = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
-    decisions = _logged_decisions(ekf2, record, timestamp_s, GNSS_POS)
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
         samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
         reported_variance.to_numpy(),
-        *decisions,
+        *_logged_decisions(ekf2, record, timestamp_s, GNSS_POS),
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
         uses_sender_times=track.age_s == 0.0 != flown_s,
-        correction_m=_position_corrections(
-            ekf2, samples.index.to_numpy(), decisions[0], flown_settings["EKF2_TAU_POS"]
-        ),
     )
 
 
 def _position_corrections(
-    ekf2: Ekf2, measured_s: Array, is_rejected: Array, tau_s: float
+    ekf2: Ekf2, received: ReceivedPositions, settings: Mapping[str, float], aid: Aid
 ) -> Array | None:
-    """Estimate EKF2's position correction (m) by each GNSS fix from the published position.
+    """Estimate EKF2's position correction (m) by each sample from the published position.
 
     Return None if all rejections are logged, or none occurred.
     """
-    if not (is_rejected > 0.0).any() or np.isfinite(is_rejected).all():
-        return None
-    if isinstance(ekf2.horizon_s, Unavailable):
+    innovations = ekf2.innovations["north"]
+    horizon_s = ekf2.horizon_s
+    if (
+        isinstance(innovations, Unavailable)
+        or isinstance(horizon_s, Unavailable)
+        or np.isfinite(received.rejected).all()
+        or not (innovations["rejected"] > 0.0).any()
+    ):
         return None
     times = ekf2.state.index.to_numpy()
     velocity, position = (
@@ -479,9 +491,14 @@ def _position_corrections(
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # the correction is in the next published position after the prediction step that fuses the fix
-    before_sample_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
-    return corrections(times, velocity, position, before_sample_s, tau_s)
+    # EKF2 publishes the correction with the prediction step that fuses the sample, at the latest
+    # one fusion horizon after the measurement, or on arrival of a sample that is late
+    published_s = np.maximum(
+        received.stamp_s - settings[aid.delay] * 1e-3 + horizon_s,
+        received.arrival_s + 0.5 * ekf2.step_s,
+    )
+    before_sample_s = np.maximum.accumulate(published_s) - 1.5 * ekf2.step_s
+    return corrections(times, velocity, position, before_sample_s, settings["EKF2_TAU_POS"])
 
 
 def read_vision(
@@ -567,13 +584,15 @@ def _logged_decisions(
     delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
-    rejected_flags[sample_row >= 0] = innovations["rejected"].to_numpy()[
-        sample_row[sample_row >= 0]
-    ]
+    logged = innovations.iloc[sample_row[sample_row >= 0]]
+    rejected_flags[sample_row >= 0] = logged["rejected"]
+    # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
+    may_reset = rejected_flags != 0.0
+    may_reset[sample_row >= 0] |= logged["innovation_m"] == 0.0
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
-        earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected_flags != 0.0))
+        earlier_rows = np.flatnonzero((publication_s <= reset_s) & may_reset)
         if (
             len(earlier_rows)
             and reset_s - publication_s[earlier_rows[-1]] < MAX_RESET_PUBLICATION_S

@@ -31,6 +31,7 @@ from px4fuse.ekf2.filter_recursion import (
     run_segment,
     with_correlation,
 )
+from px4fuse.ekf2.heights import MIN_GATE
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
@@ -170,12 +171,15 @@ def _open_without_aids(
     if isinstance(agreement, Unavailable):
         return agreement
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
+    received = inputs.received
+    has_all_decisions = received.correction_m is not None
+    if rejected_share > MANY_REJECTIONS_SHARE and (
+        has_all_decisions or np.isfinite(received.rejected).any()
+    ):
         agreement_with_decisions = agreement_with_log(
             flight, _make_replay(inputs, runs, configurations[1], {})
         )
         if isinstance(agreement_with_decisions, Agreement):
-            has_all_decisions = inputs.received.correction_m is not None
             agreement = with_logged_rejections(
                 agreement, agreement_with_decisions, has_all_decisions=has_all_decisions
             )
@@ -232,7 +236,7 @@ def replay_settings(
         )
         unused_parameters |= dict.fromkeys(
             unmodelled & BAROMETER.own_parameters,
-            height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
+            "EKF2 fused no barometer height",
         )
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
@@ -242,6 +246,10 @@ def replay_settings(
     if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
+        if inputs.logged_height_reason and name in BAROMETER.own_parameters:
+            raise SettingsError(
+                f"The effect of {name} cannot be predicted from this log: {height_text}."
+            )
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []
@@ -461,9 +469,13 @@ def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame
     )
     variance_after = run.variance[rows + 1, configuration_index]
     fused_at_s = run.segment.time_s[events.end_step[rows], None]
+    settings = run.configurations[configuration_index].settings
+    # a clipped innovation was fused: it is at the gate limit, except for rounding
+    limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
+    velocity_rejected = (nu[:, :3] ** 2 > limit * S[:, :3]).any(axis=1, keepdims=True)
     # position along north and east (m), then velocity along north, east and down (m/s)
     position = [nu[:, 3:5], S[:, 3:5], flags, variance_after[:, 6:8], variance_after[:, 3:5]]
-    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3]])
+    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3], velocity_rejected])
     index = pd.Index(events.time_s[rows], name="time_s")
     updates = pd.DataFrame(values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
     return updates if np.isfinite(nu[:, :3]).any() else updates[UPDATE_COLUMNS]

@@ -61,6 +61,8 @@ MIN_SEGMENT_S = 10.0  # minimum length of a replayed segment
 MAX_RESET_DELAY_S = 0.5
 # Maximum fraction of clipped IMU samples within 1 s; above, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
+# Maximum fraction of IMU samples outside gaps that the log lacks, to count only logged samples
+MAX_LOST_IMU_SHARE = 0.02
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # NED; CONSTANTS_ONE_G in PX4
 
@@ -124,8 +126,8 @@ class HeightSamples:
     dead_zone_m : ndarray, shape (m,)
         Dead zone: in ground effect, EKF2 ignores a height that is below the state by up to this
         distance.
-    weight : float
-        Number of barometer samples that EKF2 fused per logged sample.
+    weight : ndarray, shape (m,)
+        Number of barometer samples that EKF2 fused per known sample.
     """
 
     fused: tuple[str, ...]
@@ -135,7 +137,7 @@ class HeightSamples:
     measured_at_s: Array
     down_m: Array
     dead_zone_m: Array
-    weight: float
+    weight: Array
 
     __repr__ = one_line_repr
 
@@ -183,9 +185,15 @@ class ReplaySegment:
         Magnetometer samples (with 21 states); None if the logged EKF2 heading is used.
     heights : HeightSamples or None
         Height samples; None if the height of EKF2 or of external vision is used.
-    bad_acceleration_share : ndarray, shape (n + 1,), or None
-        Fraction of accelerometer axes with a larger noise in the step until each time: all axes
-        while EKF2 reports a bad vertical acceleration, else the clipped axes. None if always 0.
+    clipped_share : ndarray, shape (n + 1,), or None
+        Fraction of clipped accelerometer axes in the step until each time, which have a larger
+        noise. None with external vision only.
+    is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
+        True while EKF2 reports a bad vertical acceleration. None if not logged, or with external
+        vision only.
+    mean_bias_down_m_s2 : float
+        Mean vertical accelerometer bias minus nominal bias, from the acceleration and the change of
+        the published velocity.
     flow : SensorSamples or None
         Optical flow samples, if EKF2 fused optical flow.
     metres : (float, float, float)
@@ -212,7 +220,9 @@ class ReplaySegment:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    bad_acceleration_share: Array | None = None
+    clipped_share: Array | None = None
+    is_acceleration_bad: BoolArray | None = None
+    mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "ReplaySegment | None" = None
@@ -380,12 +390,21 @@ def _make_gnss_segment(
     state = segment.state.copy()
     state[POSITION] *= metres
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
+    start_s, end_s = segment.time_s[[0, -1]]
+    velocity = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
+    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity)[0]
     return replace(
         segment,
         state=state,
         metres=metres,
         correction_rad=segment.correction_rad + earth_rotation_rad,
-        bad_acceleration_share=_bad_acceleration_share(imu, record, segment.time_s),
+        clipped_share=_clipped_share(imu, segment.time_s),
+        is_acceleration_bad=(
+            record.was_in_state(BAD_ACCELERATION, segment.time_s)
+            if BAD_ACCELERATION in record.states
+            else None
+        ),
+        mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
     )
 
 
@@ -412,9 +431,9 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     return breaks
 
 
-def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
-    """Return the fraction of accelerometer axes with a larger noise in the step until each time."""
-    share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
+def _clipped_share(imu: pd.DataFrame, time_s: Array) -> Array:
+    """Return the fraction of clipped accelerometer axes in the step until each time."""
+    share_by_step = np.zeros(len(time_s))
     if "clipped" in imu:  # one bit per axis
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
@@ -654,19 +673,25 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     ndarray of int
         Ends of steps; the last end is at most n.
     """
-    samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
+    median_s = float(np.median(interval_s))
+    # number of samples in each interval; a single gap may be a gap of the IMU itself
+    sample_counts = np.maximum(np.rint(interval_s / median_s), 1.0)
+    if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_SHARE:
+        sample_counts[:] = 1.0
+    end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
+    samples_needed = samples_per_step(target_s, median_s, end_counts)
     logged_end_set = set(logged_ends.tolist())
     ends = []
-    count = 0
-    total = 0.0
-    for sample, interval in enumerate(interval_s.tolist(), start=1):
-        count = count + 1
+    count = total = 0.0
+    for sample, (interval, sample_count) in enumerate(
+        zip(interval_s.tolist(), sample_counts.tolist(), strict=True), start=1
+    ):
+        count = count + sample_count
         total = total + interval
         is_complete = count >= samples_needed and total > 0.5 * target_s
         if is_complete or total > target_s or sample in logged_end_set:
             ends.append(sample)
-            count = 0
-            total = 0.0
+            count = total = 0.0
     return np.array(ends, dtype=np.intp)
 
 

@@ -31,7 +31,7 @@ from px4fuse.ekf2.replay import (
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 what-if"
@@ -48,6 +48,10 @@ HEADING_LOGGED_NOTE = (
     "magnetometer samples"
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
+HEIGHT_START_NOTE = (
+    ". It starts with the height that EKF2 estimated with the logged parameters while it declared "
+    "its acceleration bad, so the height may be wrong at first"
+)
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
@@ -135,6 +139,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     north, east : AxisSummary
     samples : int
     rejected_fraction : float
+    velocity_rejected_fraction : float or None
+        Rejected fraction of the GNSS velocities; None if EKF2 fused no GNSS velocity.
     longest_without_fusion_s : float or Unavailable
     resets : int
         Number of resets of the horizontal position.
@@ -166,6 +172,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     late: Count = 0
     lost: Count = 0
     is_predictable: bool = True
+    velocity_rejected_fraction: Share | None = None
     without: Mapping[str, float] = {}
 
     @property
@@ -295,10 +302,11 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
             "Heading is replayed with the magnetometer (as flown it differs from the log by "
             f"{difference_deg:.1f}° RMS)"
         )
-    return (
-        heading,
-        HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE,
-    )
+    height = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
+    is_bad = model.inputs.segments[0].is_acceleration_bad
+    if height == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
+        height += HEIGHT_START_NOTE
+    return heading, height
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:
@@ -415,6 +423,9 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         resets=int(resets),
         late=replay.late,
         lost=replay.lost,
+        velocity_rejected_fraction=_mean_rejected(
+            evaluated_updates, "velocity_rejected", evaluated_s
+        ),
     )
 
 
@@ -430,7 +441,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
-        "Log estimator_aid_src_ev_pos at full rate.",
+        f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
@@ -452,7 +463,18 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         changed={},
         longest_without_fusion_s=longest_gap_s,
         resets=len(resets),
+        velocity_rejected_fraction=(
+            _mean_rejected(ekf2.aids[GNSS_VEL.name].samples, "rejected", evaluated_s)
+            if "velocity_rejected" in replay.updates and GNSS_VEL.name in ekf2.aids
+            else None
+        ),
     )
+
+
+def _mean_rejected(samples: pd.DataFrame, column: str, evaluated_s: Spans) -> float | None:
+    """Return the mean of a column over the evaluated times; None without samples."""
+    is_rejected = samples.loc[inside_spans(samples.index, evaluated_s)].get(column)
+    return None if is_rejected is None or is_rejected.empty else float(is_rejected.mean())
 
 
 def _make_summary(

@@ -16,7 +16,7 @@ from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.flight.model import Unavailable
+from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which a barometer that is not fused is no fault: the ground changes the
@@ -25,6 +25,10 @@ TAKE_OFF_S = 10.0
 # Minimum ratio of EKF2's largest height error in a gap of the barometer to its height RMSE outside
 # the gap, for severity warning
 MIN_HEIGHT_ERROR_RATIO = 3.0
+# Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
+VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
+# Maximum fraction of the time with the flag for a bad vertical acceleration, for severity note
+MAX_SHORT_BAD_ACCELERATION = 0.3
 # Action for a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
@@ -46,6 +50,41 @@ def detect(analysis: Analysis) -> Findings:
     barometer = analysis.aids.get(BAROMETER.name)
     height_error_m = _height_error_in(analysis, barometer.longest_gap_s) if barometer else None
     yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
+    yield from detect_bad_acceleration(analysis, analysis.aids)
+
+
+def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -> Findings:
+    """Detect that EKF2 declared its vertical acceleration bad in the analysed segment."""
+    ekf2 = analysis.flight.ekf2
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.record, Unavailable):
+        return
+    times = ekf2.state.index.to_numpy()
+    times = times[(times >= analysis.segment.start_s) & (times <= analysis.segment.end_s)]
+    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION, times)
+    if not is_bad.any():
+        return
+    noises = {
+        AIDS[name].noise
+        for name in VERTICAL_AIDS
+        if name in aids and aids[name].verdict == "overconfident"
+    }
+    cause = "Random innovations can cause this for some seconds."
+    remedy = "Change nothing for a few seconds; else check the IMU for vibration and clipping."
+    if noises:
+        cause = "The cause is that EKF2 assumes too small a noise for these sensors."
+        remedy = f"Increase {' and '.join(sorted(noises))} to the true noise."
+    share, start_s = float(is_bad.mean()), float(times[is_bad.argmax()])
+    is_long = share > MAX_SHORT_BAD_ACCELERATION
+    yield finding(
+        "warning" if is_long else "note",
+        "ekf2_acceleration_bad",
+        f"EKF2 declares its vertical acceleration bad for {format_percent(share)} of the time, "
+        f"first at {start_s:.0f} s. Barometer and GNSS both measure that the vehicle is above "
+        "EKF2's height. EKF2 then distrusts the accelerometer and keeps its bias constant. "
+        f"{cause}",
+        remedy,
+        {"fraction": share, "start_s": start_s},
+    )
 
 
 def detect_in_aids(

@@ -143,13 +143,15 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
     has_own_yaw = analysis.source.frame == "FRD" or (
         isinstance(fusing, pd.DataFrame) and fraction_on(fusing["yaw"], segment) > 0.0
     )
+    has_yaw = analysis.source.orientation is not None
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
         (
             "yaw_align",
             "heading",
-            "Calibrate and enable the magnetometer, or send the orientation of the source and let "
-            "EKF2 fuse its yaw.",
+            "Calibrate and enable the magnetometer, or "
+            f"{'' if has_yaw else 'send the orientation of the source and '}let EKF2 fuse the yaw "
+            "of the source.",
         ),
     ):
         steps = ekf2.states.get(flag)

@@ -41,8 +41,9 @@ from px4fuse.findings.cause_text import (
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
+from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum ratio of a setting and its estimate (σ) for a warning: with less the track hardly changes
@@ -313,6 +314,8 @@ def _variance_finding(
         cause = NOISE if remedy_text else ELSEWHERE
         fallback = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
         severity, remedy_text = severity if remedy_text else "note", remedy_text or fallback
+    elif is_underconfident and filter_name == "ekf2" and (floor := _noise_minimum(analysis)):
+        severity, remedy_text, cause = "note", floor, ELSEWHERE
     elif is_underconfident and any(
         name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
     ):
@@ -343,18 +346,34 @@ def _variance_finding(
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    """Format the action if EKF2's GNSS noise exceeds the σ that the receiver reports."""
+    """Format the action if EKF2's GNSS noise exceeds the receiver's σ and the estimated noise."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
     reported_m = float(np.sqrt(reported_variance.median()))
-    if not parameter_m > NOISE_RATIO_TOLERANCE * reported_m:  # false for NaN too
+    tuned = first_axis_tuning(analysis.tuning, HORIZONTAL)
+    noise_m = max(reported_m, (tuned.sigma_z.value if tuned else None) or 0.0)
+    if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # false for NaN too
+        return ""
+    source = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
+    return (
+        f"{name} is {parameter_m:g} m, but {source} {noise_m:.2g} m: test this value with px4fuse "
+        "whatif."
+    )
+
+
+def _noise_minimum(analysis: Analysis) -> str:
+    """Describe EKF2's minimum noise of vision positions if GNSS sets it, else return ""."""
+    parameters = analysis.flight.log.parameters
+    gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+    is_besides_gnss = analysis.source.origin.is_vision and fused_aid(analysis.flight.ekf2)
+    if not is_besides_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
         return ""
     return (
-        f"{name} is {parameter_m:g} m, but the receiver reports {reported_m:.2g} m: test this "
-        "value with px4fuse whatif."
+        "No change: while EKF2 fuses GNSS, it assumes for vision positions at least "
+        f"{GNSS_POS.noise} ({gnss_m:g} m)."
     )
 
 

@@ -10,6 +10,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
+from px4fuse.flight.ekf2_parameters import MAG
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
@@ -31,6 +32,8 @@ LARGE_HEADING_ERROR_DEG = 15.0
 MIN_TRUE_DRIFT_SHARE = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
+# EKF2_MAG_TYPE without magnetometer
+NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
 
@@ -87,10 +90,10 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
-        action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
+        action = f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
     elif analysis.source.name == IN_EKF2_FRAME:
         reason = "EKF2 fused them in this frame; the IMU measures the motion in another direction."
-        action = f"Align the positioning frame with north. Or: {CALIBRATE}"
+        action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
         reason = (
@@ -99,7 +102,8 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-        action += f" Or: {CALIBRATE}"
+    if not analysis.source.origin.is_gnss and (calibrate := _calibrate(analysis)):
+        action += f" Or: {calibrate}"
     yield finding(
         "error" if abs(rotation_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
@@ -109,6 +113,12 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
+
+
+def _calibrate(analysis: Analysis) -> str:
+    """Return the action for the magnetometer; empty if EKF2 does not use it."""
+    mag_type = analysis.flight.log.parameters.get(MAG.switch)
+    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE
 
 
 def _is_explained_by_bias(analysis: Analysis) -> bool:
@@ -151,6 +161,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
+    elif analysis.source.orientation is None:
+        action = ""  # the source has no yaw that EKF2 could fuse
     elif not analysis.flight.log.has_ulog:
         action = "Or let the autopilot fuse the yaw of the source."
     return finding(
@@ -161,7 +173,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
         f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
-        f"{CALIBRATE} {action}",
+        f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,

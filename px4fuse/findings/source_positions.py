@@ -216,12 +216,16 @@ def detect_jumps(analysis: Analysis) -> Findings:
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
             cause = "The source announced it (reset_counter): it relocalised or set a new origin."
         extent = f"by {size_m:.2f} m"
+        steps_m = np.array([[step.value for step in jump.step_m] for jump in large])
+        end = "stay there"
+        if np.linalg.norm(steps_m.sum(axis=0)) < MIN_JUMP_M:
+            end = "return afterwards"
         if len(large) > 1:
             extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} jump {extent} at {at_s:.1f} s and stay there. The IMU measures no such "
+            f"{positions} jump {extent} at {at_s:.1f} s and {end}. The IMU measures no such "
             f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
             "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
             f"{action} Analyse one side of the jump (--start, --end).",

@@ -351,8 +351,9 @@ class FusionRecord:
         Latitude of the origin; NaN if not logged.
     altitude_m : float
         Altitude of the origin if EKF2 stores altitude above sea level (since v1.16); otherwise 0.
-    height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
-        Height of the aid minus height of the reference: ``bias_m``, with variance ``bias_m2``.
+    height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 4)
+        Updates of the height of the aid minus height of the reference: ``bias_m`` and its variance
+        ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``.
     states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
         Step functions: 1 while EKF2 detects ground effect on the barometer, or wrong vertical
         acceleration; otherwise 0. Contains logged states only.
@@ -398,7 +399,9 @@ class AidLog:
         Indexed by measurement time, for each axis: ``innovation_<axis>`` (measurement minus
         prediction) and ``variance_<axis>`` (S). From ``estimator_aid_src`` topics also
         ``noise_<axis>`` (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0),
-        for external vision position ``observation_<axis>``. In the unit of the aid or its square.
+        for external vision position and barometer ``observation_<axis>``, and for the barometer
+        ``filtered_down`` (prediction minus measurement, low-pass filtered). In the unit of the aid
+        or its square.
     enabled : Series or None
         Step function: 1 while fusion of the aid is enabled, otherwise 0; None if not logged.
     parameters : mapping

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, Aid
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, DISTURBANCES, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
@@ -87,7 +87,8 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
         )
     }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
-    layout = Layout(f"estimator_aid_src_{aid.name}", columns)
+    more = {"observation_down": "observation", "filtered_down": "innovation_filtered"}
+    layout = Layout(f"estimator_aid_src_{aid.name}", columns, more if aid == BAROMETER else {})
     if topics.find(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()

@@ -200,7 +200,9 @@ def _step_s(topics: Topics) -> float:
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
         return configured_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    step_ends = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
+    end_rows = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
+    # in IMU intervals, because the logger may have dropped IMU samples
+    step_ends = np.rint((imu_s[end_rows] - imu_s[0]) / interval_s)
     return samples_per_step(configured_s, interval_s, step_ends) * interval_s
 
 

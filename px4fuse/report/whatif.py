@@ -61,6 +61,8 @@ def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
             f"{name}: position RMSE (m)": _format_number(axis.position_rmse_to_truth_m),
         }
     texts |= {"samples": f"{summary.samples}", **_fusion_texts(summary)}
+    if summary.velocity_rejected_fraction is not None:
+        texts["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
     if isinstance(replayed.heading_error_mean_deg, float):
         texts["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
     if replayed.heights:

@@ -263,8 +263,9 @@ def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSample
     """Make the height samples of the barometer, the only height source of EKF2 outdoors."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
-    return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
+    no_dead_zone, weight = np.zeros(len(down_m)), np.ones(len(down_m))
+    samples = barometer_samples_inside(segment, measured_at_s, down_m, no_dead_zone, weight)
+    return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
 
 
 def _initial_state_at_rest(

@@ -1,0 +1,178 @@
+"""Barometer samples that EKF2 fused, also those that the logger dropped.
+
+The default logging profile has 5 of 10 or 20 samples per second in ``vehicle_air_data``. Each row
+of ``estimator_aid_src_baro_hgt`` contains another sample (without EKF2's bias), and each row of
+``estimator_baro_bias`` the innovation of another one. From PX4 v1.16 on, the low-pass filtered
+innovation determines the mean of the samples that are missing between two rows; only their scatter
+is simulated.
+
+Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
+``EKF/aid_sources/barometer/baro_height_control.cpp``, ``EKF/bias_estimator/bias_estimator.cpp``.
+"""
+
+import numpy as np
+import pandas as pd
+from scipy.integrate import cumulative_trapezoid
+
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.ekf2.bias import BIAS_DENSITY
+from px4fuse.ekf2.replay_segments import INNOVATION_FILTER_S
+from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
+
+# Rate (Hz) at which EKF2 fuses the barometer, from PX4 v1.15 on, if the variance of the barometer
+# bias does not show the rate
+BAROMETER_HZ = 10.0
+# Rate (Hz) at which EKF2 fuses the barometer, before PX4 v1.15
+OLD_BAROMETER_HZ = 15.0
+# Maximum relative interquartile range of sample intervals that are computed from the bias variance
+MAX_INTERVAL_SCATTER = 0.1
+# Maximum time difference of two data of one sample, in sample intervals
+MATCH_TOLERANCE = 0.3
+# Maximum number of samples between two rows for reconstructing them from the filtered innovation
+MAX_SAMPLES_PER_ROW = 30
+# Maximum number of samples that one sample replaces
+MAX_WEIGHT = 4.0
+MIN_WEIGHT = 1e-9  # minimum weight of missing samples, to avoid a division by zero
+
+
+def sample_interval_s(record: FusionRecord) -> float:
+    """Return the interval (s) of the barometer samples that EKF2 fuses.
+
+    In the steady state, an update reduces the variance of the barometer bias by as much as it has
+    grown since the previous sample: p' = p - p²/S and p = p' + q² Δt.
+    """
+    bias = record.height_bias.get(BAROMETER.name)
+    if bias is not None and len(bias) > 1:
+        variance_m2 = bias["variance_m2"] * _bias_gain(bias)
+        intervals_s = (variance_m2 - bias["bias_m2"])[len(bias) // 5 :] / BIAS_DENSITY**2
+        low, median, high = np.percentile(intervals_s, [25.0, 50.0, 75.0])
+        if high - low < MAX_INTERVAL_SCATTER * median:
+            return float(median)
+    return 1.0 / (OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ)
+
+
+def _bias_gain(bias: pd.DataFrame) -> Array:
+    """Return the Kalman gain K = p/S of the logged updates of the barometer bias.
+
+    The log contains the variance after the update, p' = p - p²/S.
+    """
+    ratio = (bias["bias_m2"] / bias["variance_m2"]).to_numpy()
+    return np.asarray(0.5 - 0.5 * np.sqrt(np.maximum(1.0 - 4.0 * ratio, 0.0)))
+
+
+def fused_samples(ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]") -> pd.DataFrame:
+    """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
+
+    The columns are ``down_m`` (height) and ``weight``: 1, or more beside samples that remain
+    missing. ``logged`` is the logged height (m, down) of the barometer at measurement times.
+    """
+    interval_s = sample_interval_s(record)
+    samples = _known_and_simulated_samples(ekf2, record, logged, interval_s)
+    distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
+    # a sample replaces half of the missing samples before and after it
+    weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
+    return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_WEIGHT)})
+
+
+def _known_and_simulated_samples(
+    ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]", interval_s: float
+) -> "pd.Series[float]":
+    rows = ekf2.aids[BAROMETER.name].samples
+    if "observation_down" not in rows or len(rows) < 2:
+        return logged
+    row_s = rows.index.to_numpy()
+    velocity = ekf2.state["down_m_s"]
+    velocity_s = velocity.index.to_numpy()
+    moved_m = cumulative_trapezoid(velocity.to_numpy(), velocity_s, initial=0)
+    no_bias = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
+    no_bias |= {"innovation_m": np.nan, "variance_m2": 1.0}
+    bias = record.height_bias.get(BAROMETER.name, pd.DataFrame(no_bias, index=row_s[:1]))
+    # EKF2 logs the bias after the update with a sample, but fuses the sample with the previous bias
+    bias_s = np.column_stack([bias.index, bias.index + 0.5 * interval_s]).ravel()
+    previous_m = bias["bias_m"] - (_bias_gain(bias) * bias["innovation_m"]).fillna(0.0)
+    fused_bias_m = np.column_stack([previous_m, bias["bias_m"]]).ravel()
+    # in ground effect the logged innovation is reduced by the dead zone
+    calm = rows[~record.was_in_state(GROUND_EFFECT, row_s)]
+    still_m = calm["observation_down"] - calm["innovation_down"]
+    still_m -= np.interp(calm.index, velocity_s, moved_m)
+
+    def bias_m(time_s: Array) -> Array:
+        return np.asarray(np.interp(time_s, bias_s, fused_bias_m))
+
+    def prediction_m(time_s: Array) -> Array:
+        """Return EKF2's prediction of the logged height, with the motion between rows."""
+        state_m = np.interp(time_s, calm.index, still_m) + np.interp(time_s, velocity_s, moved_m)
+        return np.asarray(state_m - bias_m(time_s))
+
+    # one row per row of the log, one column per sample since the previous row
+    span_s = np.diff(row_s)
+    count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
+    is_regular = np.abs(span_s - count * interval_s) < MATCH_TOLERANCE * interval_s
+    is_regular &= count <= MAX_SAMPLES_PER_ROW
+    sample_s = span_s / count
+    column = np.arange(count[is_regular].max(initial=1))
+    innovation_m = np.full((len(count), len(column)), np.nan)
+    # samples of several topics; the last one is preferred if they are the same sample
+    time_s = np.concatenate([bias.index, logged.index, row_s])
+    down_m = np.concatenate(
+        [
+            prediction_m(bias.index.to_numpy()) - bias["innovation_m"],
+            logged,
+            rows["observation_down"] - bias_m(row_s),
+        ]
+    )
+    row = np.searchsorted(row_s[1:], time_s - MATCH_TOLERANCE * interval_s)
+    row = np.minimum(row, len(count) - 1)
+    place = (time_s - row_s[row]) / sample_s[row]
+    is_matched = is_regular[row] & (np.abs(place - np.rint(place)) < MATCH_TOLERANCE)
+    is_matched &= (place > MATCH_TOLERANCE) & (place < count[row] + MATCH_TOLERANCE)
+    innovation_m[row[is_matched], np.rint(place[is_matched]).astype(int) - 1] = (
+        down_m - prediction_m(time_s)
+    )[is_matched]
+    if "filtered_down" in rows:
+        # PX4 logs state minus measurement
+        filtered_m = -rows["filtered_down"].to_numpy()
+        age = count[:, None] - 1.0 - column
+        is_missing = np.isnan(innovation_m) & (age >= 0.0) & is_regular[:, None]
+        innovation_m = _with_missing_innovations(
+            innovation_m, is_missing, sample_s[:, None], age, filtered_m
+        )
+    sampled_s = row_s[:-1, None] + sample_s[:, None] * (column + 1)
+    has_sample = np.isfinite(innovation_m)
+    sampled_s = sampled_s[has_sample]
+    time_s = np.concatenate([sampled_s, time_s[~is_matched]])
+    down_m = np.concatenate(
+        [prediction_m(sampled_s) + innovation_m[has_sample], down_m[~is_matched]]
+    )
+    samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
+    return samples[np.diff(samples.index, prepend=-np.inf) > MATCH_TOLERANCE * interval_s]
+
+
+def _with_missing_innovations(
+    innovation_m: Array, is_missing: BoolArray, interval_s: Array, age: Array, filtered_m: Array
+) -> Array:
+    """Simulate missing innovations such that their low-pass filtered value is as logged.
+
+    Parameters
+    ----------
+    innovation_m, is_missing : ndarray, shape (n, k)
+        Innovations of the k samples before each of n rows of the log.
+    interval_s : ndarray, shape (n, 1)
+        Time between two samples.
+    age : ndarray, shape (n, k)
+        Number of samples from each sample to the row.
+    filtered_m : ndarray, shape (n + 1,)
+        Low-pass filtered innovation at the start and at each row.
+    """
+    share = interval_s / (interval_s + INNOVATION_FILTER_S)
+    weight = share * (1.0 - share) ** np.maximum(age, 0.0)
+    missing_weight = weight * is_missing
+    scatter_m = np.random.default_rng(0).normal(
+        scale=np.nanstd(innovation_m), size=innovation_m.shape
+    )
+    decay = (1.0 - share[:, 0]) ** (age[:, 0] + 1.0)
+    known_m = np.nansum(weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(axis=1)
+    offset_m = filtered_m[1:] - decay * filtered_m[:-1] - known_m
+    offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT)
+    return np.where(is_missing, scatter_m + offset_m[:, None], innovation_m)
