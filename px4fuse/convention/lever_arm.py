@@ -26,6 +26,8 @@ MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS = 0.05, 5.0
 MAX_ARM_M = 5.0
 # Maximum residual in σ of a sample that is used
 CLIPPED_SIGMAS = 3.0
+# Minimum ratio of the singular values of a fit with ground truth
+MIN_SINGULAR_RATIO = 0.02
 # Minimum number of measured coordinates for a fit with ground truth
 MIN_ROWS = 40
 # Number of least squares fits with outlier removal
@@ -73,11 +75,13 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     rows, values = design[is_known].reshape(-1, 5), error_m[is_known].ravel()
     if len(rows) < MIN_ROWS:
         return None
-    fit = np.linalg.lstsq(rows, values, rcond=None)[0]
+    fit, _, rank, _ = np.linalg.lstsq(rows, values, rcond=MIN_SINGULAR_RATIO)
+    if rank < rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
+        return None
     residual = (values - rows @ fit).reshape(-1, 2)
     # successive errors of a source may be correlated
     excess = max(map(autocorrelation_time, residual.T))
-    covariance = np.linalg.pinv(rows.T @ rows) * np.mean(residual**2) * excess
+    covariance = np.linalg.inv(rows.T @ rows) * np.mean(residual**2) * excess
     sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
     arm = LeverArm(float(fit[0]), float(fit[1]), sigma_m)
     is_significant = arm.size_m > max(MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS * sigma_m)

@@ -416,7 +416,7 @@ def _move_to_reference_body(
     return moved, (
         f"The orientations differ by a constant {np.degrees(body.magnitude()):.1f}°: the estimate "
         "has other body axes than the reference, for example those of a camera. Its origin is at "
-        f"{components} of the reference body. Both are corrected, so they are no errors.",
+        f"{components} of the reference body. Both are corrected before the errors are computed.",
     )
 
 
