@@ -180,7 +180,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str:
         ]
         sizes_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*errors))))))
     before, after = map(format_metres, sizes_m)
-    return f"Replay of EKF2 with it: horizontal position RMSE {before} m → {after} m. "
+    return f"Replay of EKF2 with this lever arm: horizontal position RMSE {before} m → {after} m. "
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:

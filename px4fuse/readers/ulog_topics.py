@@ -184,7 +184,7 @@ class Topics:
         Number of samples with an invalid timestamp, by topic and instance; filled by
         :meth:`frame`.
     ekf2_parameters : mapping
-        All EKF2_ parameters at take-off by PX4 name; ``log`` contains only the parameters used in
+        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters used in
         results.
     is_cut : bool
         True if the file ends within a message.
