@@ -314,7 +314,7 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "This analysis contains no request, so its command is unknown.",
+            "This analysis was not made by px4fuse.compare, so its command is unknown.",
             "Make the analysis with px4fuse.compare.",
         )
     return analysis.request

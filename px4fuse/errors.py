@@ -19,7 +19,9 @@ from collections.abc import Iterable
 
 
 def suggest_name(name: str, known_names: Iterable[str]) -> str:
-    """Return "Did you mean X? " with the most similar known name X; "" without a similar name.
+    """Return "Did you mean X? " with the most similar known name X.
+
+    Return an empty string if there is no similar name.
 
     >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
@@ -42,7 +44,7 @@ def to_one_line(text: str) -> str:
 
 
 class Px4FuseError(Exception):
-    """Base class of all errors of px4fuse; the text is put on one line.
+    """Base class of all errors of px4fuse, with a text on one line.
 
     Parameters
     ----------

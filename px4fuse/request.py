@@ -266,7 +266,10 @@ _POSITION_OPTIONS = {
 def _option_names(
     kind: type[msgspec.Struct], excluded: Sequence[str] = (), **exceptions: str
 ) -> dict[str, str]:
-    """Return the option of each optional field: its name with hyphens and without the unit."""
+    """Return the command line options of the optional fields of a request.
+
+    An option is the field name with hyphens and without unit, except for ``exceptions``.
+    """
     names = {
         field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(kind)
@@ -390,5 +393,5 @@ def _option_text(value: Any) -> str:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name in a path; bytes that are not UTF-8 are replaced by question marks."""
+    """Return the file name in a path, with question marks for bytes that are not UTF-8."""
     return PurePath(path).name.encode(errors="replace").decode()

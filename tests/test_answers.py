@@ -62,10 +62,10 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a" * 30_000, "the file has 0.03 MB; the limit is 0.02 MB"),
+        ("a" * 30_000, "the file has 0.03 MB, more than the limit of 0.02 MB"),
         ("a." * 400 + "b = 1", "a line has more than 500"),
-        ("x = " + "[" * 450, "Correct the form with the answers"),
-        ("log_sha256 = 'x'", "Correct the form with the answers"),
+        ("x = " + "[" * 450, "Correct the answer form"),
+        ("log_sha256 = 'x'", "Correct the answer form"),
         (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
         (EMPTY + CLAIM.format("yaw", "size = 900"), "is out of range"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = nan"), "size"),

@@ -141,7 +141,7 @@ def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedRepor
     assert honest.instructor_action == ""
     assert honest.flags == ()
     points = {item.title: item.points / item.max_points for item in honest.items}
-    assert points["Mistakes of the flight"] > 0.4, honest.items
+    assert points["Injected faults of the flight"] > 0.4, honest.items
 
 
 # ------------------------------------------------------------------ words

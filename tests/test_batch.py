@@ -209,7 +209,7 @@ def test_batch_log_without_position_has_status_not_compared(tmp_path):
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
     assert row["aids"].startswith("gnss_pos underconfident")
-    assert "1 reused from an earlier run" in command(log, "-o", tmp_path / "out").output
+    assert "from an earlier run: 1" in command(log, "-o", tmp_path / "out").output
 
 
 @pytest.mark.reallogs
@@ -264,7 +264,7 @@ def test_batch_stopped_by_ctrl_c_keeps_finished_results(flights, undisturbed, tm
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
         _, said = process.communicate()
     assert process.returncode == 130
-    assert said.startswith("px4fuse: interrupted; finished results are in")
+    assert said.startswith("px4fuse: interrupted; results of finished logs are in")
     assert said.count("\n") == 1
     again = run_checked("batch", flights, "-o", tmp_path).output
     assert "3 logs: 3 done" in again
@@ -292,7 +292,7 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
     hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
     assert (hang["status"], crash["status"]) == ("failed", "failed")
-    assert hang["reason"] == "the time limit of 600 s was exceeded"
+    assert hang["reason"] == "the job exceeded the time limit of 600 s"
     assert "--timeout" in hang["remedy"]
     assert crash["reason"] == "the worker process ended during a job (exit code 3)"
 
@@ -345,7 +345,7 @@ def test_batch_interrupted_run_reuses_finished_results(
     (tmp_path / "rows" / f"{'0' * 64}.json").write_bytes(b"{}")
     (tmp_path / "rows" / "folder.json").mkdir()
     again = command(flights, "-o", tmp_path)
-    assert "3 logs: 3 done; 1 reused" in again.output
+    assert "3 logs: 3 done; from an earlier run: 1" in again.output
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 
@@ -411,7 +411,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     found = analysed(log.address)
     assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
     (small,) = analysed(log.address, max_bytes=10).rows
-    assert small["reason"] == "the file has 1 MB; the limit is 0 MB"
+    assert small["reason"] == "the file has 1 MB, more than the limit of 0 MB"
 
 
 @pytest.mark.reallogs
@@ -531,5 +531,5 @@ def assert_killed_scheduler_prints_one_line(address, tmp_path):
     _, said = process.communicate(timeout=120)
     assert process.returncode == 2
     assert said.startswith("px4fuse: the connection to the Dask scheduler was lost")
-    assert said.endswith("Finished results are kept. Run the same command to continue.\n")
+    assert said.endswith("Results of finished logs are kept. Run the same command to continue.\n")
     assert said.count("\n") == 1

@@ -153,7 +153,7 @@ def test_class_page_average_excludes_pending_points() -> None:
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
-                         ["13 / 20", 13.0, "set by instructor"]]  # fmt: skip
+                         ["13 / 20", 13.0, "changed by instructor"]]  # fmt: skip
 
 
 def test_class_page_shortens_long_text_and_omits_nan() -> None:
@@ -210,7 +210,7 @@ def test_class_page_in_anonymous_mode_contains_no_names() -> None:
     assert {tuple(row) for rows in points for row in rows} == {("Settings", "9", "20", "")}
     assert [
         "list",
-        "Mistakes of this flight",
+        "Injected faults of this flight",
         ["positions that jump: not named in the answer form"],
         False,
     ] in parts

@@ -78,7 +78,7 @@ def test_diff_of_two_clean_flights_reports_no_worse_verdict(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
     assert {one.name for one in found.settings} <= {
-        "start of the analysis (s)",
+        "start of the analysed time (s)",
         "end of the analysis (s)",
     }
     assert list_changes(clean, clean).numbers == ()

@@ -108,7 +108,7 @@ def test_diff_of_unsuitable_files_is_rejected(settings, tmp_path):
         (usual, old, "uses schema version 1.0"),
         (usual, other, "contains no results of px4fuse"),
         (usual, printed, "o results.json is attached"),
-        (usual, tmp_path / "missing.ulg", "missing.ulg: cannot be read"),
+        (usual, tmp_path / "missing.ulg", "missing.ulg: the file cannot be read"),
         (tmp_path, usual, "is a folder"),
         (text, usual, "notes.txt"),
     ):

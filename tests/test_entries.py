@@ -116,7 +116,7 @@ def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
     (ada, _), _ = make_entries(files)
     assert ada.total == 4.0
-    assert "is not a report" in ada.flags[0]
+    assert "status: no report" in ada.flags[0]
     (ada, _), _ = make_entries({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
@@ -132,7 +132,8 @@ def test_class_entry_with_differing_answer_forms_is_pending() -> None:
     (ada, _), _ = make_entries(files)
     assert ada.total is None
     assert (
-        ada.counted_report.instructor_action == "Ask which of 2 reports counts: their forms differ."
+        ada.counted_report.instructor_action
+        == "Ask the student which of 2 reports counts: the answer forms differ."
     )
     assert len(ada.other_reports) == 1
     assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
@@ -152,7 +153,7 @@ def test_pending_report_does_not_replace_the_graded_report() -> None:
         (ada, _), _ = make_entries(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.other_reports] == ["z.pdf"]
-        assert ada.flags == ("z.pdf is pending, so another file counts.",)
+        assert ada.flags == ("The file z.pdf does not count (status: pending).",)
     waiting = replace(
         files["a.pdf"].items[0], awaits_points=True
     )  # waits for the points of the notes
@@ -166,7 +167,7 @@ def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     (ada, _), _ = make_entries({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The file name looks like a file name of a platform, but a student wrote it "
+        "The student imitated the file name of a learning platform "
         "(platform of the export: Blackboard).",
     )
 
@@ -313,12 +314,12 @@ def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc': give a number of 0 or more"),
-        ("1,A,-1,", "give a number"),
-        ("1,A,nan,", "give a number"),
-        ("1,A,1_5,", "give a number"),
-        ("1,,5,", "and an item or total"),
-        ("1,A,5,\n1,A,6,", "a second row for student 1, item A"),
+        ("1,A,abc,", "row 2: points 'abc' must be a number of 0 or more"),
+        ("1,A,-1,", "must be a number of 0 or more"),
+        ("1,A,nan,", "must be a number of 0 or more"),
+        ("1,A,1_5,", "must be a number of 0 or more"),
+        ("1,,5,", "for an item or total"),
+        ("1,A,5,\n1,A,6,", "student 1 has another row for item A"),
     ],
 )
 def test_read_overrides_with_invalid_row_raises_error(tmp_path, row, says) -> None:

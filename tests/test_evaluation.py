@@ -339,7 +339,7 @@ def test_evaluate_without_orientation_or_pairs_states_reason() -> None:
     (("slam", "camera"), ("truth", "NED"), "a", 2.0, "sim3", "the scale factor 0.5"),
     (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "is monocular"),
     (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
-    (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "kind unknown"),
+    (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "kind is unknown"),
     (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
 ])  # fmt: skip
 def test_default_alignment_depends_on_source_kind_and_frame(
@@ -426,7 +426,7 @@ def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
         ("a pose every 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
         ("Only 33%", vio, truth[:400], {}),
         ("covers only 33%", vio[:400], truth, {}),
-        ("0.667 fits best", large, truth, {"alignment": "se3"}),
+        ("is 0.667 instead of 1", large, truth, {"alignment": "se3"}),
     ):
         assert said in evaluate(estimate, reference, **how).warnings[0]
 

@@ -211,7 +211,7 @@ def test_extracted_table_names_are_valid_file_names(sample_flight):
 
 
 @pytest.mark.parametrize(("options", "said"), [
-    ([], "is not a folder"), (["--format", "parquet"], 'pip install "px4fuse[parquet]"'),
+    ([], "is a file"), (["--format", "parquet"], 'pip install "px4fuse[parquet]"'),
 ])  # fmt: skip
 def test_extract_to_unwritable_folder_prints_one_error_line(
     tmp_path, monkeypatch, capsys, sample_log, options, said

@@ -219,7 +219,7 @@ def test_batch_page_without_javascript_shows_a_table(browser: Browser, tmp_path:
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
     assert "The first 300 of 400 logs." in text
-    assert "All rows are in fleet.csv." in text
+    assert "The table fleet.csv contains all rows." in text
     names = [log["name"] for log in sort_logs(logs_of(artificial_logs(400)))]
     table = text.split("Enable JavaScript")[1]
     assert [name in table for name in names] == [True] * 300 + [False] * 100

@@ -218,7 +218,7 @@ def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch)
     result = run("grade", "a.pdf", "-o", "out")
     assert isinstance(result.exception, Interrupted)
     assert result.exception.exit_code == 130
-    assert "finished results are in out" in str(result.exception)
+    assert "results of verified reports are in out" in str(result.exception)
     assert "Run the same command to continue." in str(result.exception)
 
 

@@ -79,7 +79,7 @@ def class_desk(tmp_path, monkeypatch) -> Path:
 )  # fmt: skip
 def test_grade_refuses_output_folder_that_contains_inputs(class_desk, command) -> None:
     before = file_hashes(class_desk)
-    assert "contains an input of this command" in error_line(*command.split())
+    assert "an input of this command" in error_line(*command.split())
     assert file_hashes(class_desk) == before
 
 
@@ -87,7 +87,7 @@ def test_grade_refuses_output_folder_linked_to_its_inputs(class_desk) -> None:
     (class_desk / "out").mkdir()
     (class_desk / "out" / "reports").symlink_to(class_desk / "h" / "reports")
     before = file_hashes(class_desk)
-    assert "contains an input" in error_line("grade", "h/reports", "-o", "out")
+    assert "an input of this command" in error_line("grade", "h/reports", "-o", "out")
     assert file_hashes(class_desk) == before
 
 
@@ -127,7 +127,7 @@ def test_batch_refuses_output_folder_that_contains_logs(tmp_path, monkeypatch) -
     (tmp_path / "d" / "in").mkdir(parents=True)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/in/fleet.ulg")
     for logs in ("d", "d/in/fleet.ulg", "d/*/*.ulg"):
-        assert "-o d contains an input" in error_line("batch", logs, "-o", "d")
+        assert "the output folder d contains" in error_line("batch", logs, "-o", "d")
 
 
 # --- the register ---

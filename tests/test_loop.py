@@ -260,8 +260,8 @@ def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
     assert judged.distance_m == pytest.approx(SIDE_M * np.sqrt(2.0), rel=0.2)
     for part in (found.corrections["by_distance"], found.corrections["pose_graph_gated"]):
         assert isinstance(part, Unavailable)
-        assert "the gate rejects the closure" in part.reason
-        assert "the gate rejects the closure" in part.reason
+        assert "the gate rejects the loop closure" in part.reason
+        assert "the gate rejects the loop closure" in part.reason
     finding = find_loop(found)[0]
     assert (finding.id, finding.severity) == ("false_loop_closure", "error")
     assert finding.evidence["p"] < 0.001

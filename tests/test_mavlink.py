@@ -162,7 +162,7 @@ def test_mavlink_raw_imu_is_unavailable_with_reason(read):
     ))  # fmt: skip
     flight = read(recorder)
     assert isinstance(flight.imu, Unavailable)
-    assert "2000 RAW_IMU messages were not used: raw counts" in reason(flight, "IMU")
+    assert "2000 RAW_IMU messages are not used, because raw counts" in reason(flight, "IMU")
     assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
 
 
@@ -256,7 +256,7 @@ def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, na
     flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
     if not name:
         assert flight.positions == ()
-        assert "no ODOMETRY to the autopilot" in reason(flight, "position source ODOMETRY")
+        assert "no ODOMETRY sent to the autopilot" in reason(flight, "position source ODOMETRY")
         return
     [track] = flight.positions
     assert (track.name, track.origin, track.topics) == (name, origin, ("ODOMETRY",))

@@ -296,7 +296,6 @@ def other_digit(writer: PdfWriter) -> None:
 
 
 WHITE = b"q 1 g 50 690 300 90 re f Q"
-OWN = "that px4fuse does not write"
 # Forgery, the beginning of a difference, and whether it is one of structure
 FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # form fields
@@ -330,7 +329,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     },
     "no annotations": (page(1, "/Annots", array()), "an annotation", True),
     # fonts
-    "glyphs exchanged by a map": (exchanged_glyphs, "the PDF entry /CIDToGIDMap is of", True),
+    "glyphs exchanged by a map": (exchanged_glyphs, "the type of the PDF entry /CIDToGIDMap", True),
     "outlines exchanged": (
         replace_stream(descriptor, "/FontFile2", exchanged_outlines), "the content of /FontFile2 ",
         False,
@@ -339,7 +338,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         replace_stream(font("/f0"), "/ToUnicode", lambda c: c.replace(b"> <0031>", b"> <0039>")),
         "the content of /ToUnicode ", False,
     ),
-    "widths": (descendant("/W", array(N(0), N(60), N(0))), "the array /W has 3 elements", True),
+    "widths": (descendant("/W", array(N(0), N(60), N(0))), "the PDF array /W has 3 elements", True),
     "the default width": (descendant("/DW", N(900)), "the PDF entry /DW is '900'", False),
     "vertical widths": (descendant("/DW2", array(N(0), N(1))), "an entry /DW2", True),
     "another encoding": (
@@ -415,9 +414,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a long content": (content(lambda c: c * 5), "the content of /Contents ", False),
     "a comment": (content(lambda c: c + b"\n% x\n"), "drawing operation", False),
-    "a second content stream": (second_content, "the PDF entry /Contents is of another type", True),
-    "an array of contents": (contents_in_an_array, "the PDF entry /Contents is of", True),
-    "content taken for a JPEG": (jpeg_content, "the PDF entry /Contents has another", True),
+    "a second content stream": (second_content, "the type of the PDF entry /Contents", True),
+    "an array of contents": (contents_in_an_array, "the type of the PDF entry /Contents", True),
+    "content taken for a JPEG": (jpeg_content, "the compression of the PDF entry /Contents", True),
     # resources
     "an image": (
         draw_on_page(b"q 300 0 0 90 50 690 cm /X Do Q", resource("/XObject", "/X", image())),
@@ -448,7 +447,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a pattern": (resource("/Pattern", "/p9", stream(WHITE)), "an entry /Pattern", True),
     "a colour space": (
-        resource("/ColorSpace", "/c0", array(name("DeviceCMYK"))), "the array /c0 has 1", True,
+        resource("/ColorSpace", "/c0", array(name("DeviceCMYK"))), "the PDF array /c0 has 1", True,
     ),
     "a property list": (
         resource("/Properties", "/MC0", dictionary(ActualText=STRING("x"))),
@@ -459,11 +458,11 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a page cut": (page(2, "/CropBox", box(0, 0, 300, 300)), "a crop box", True),
     "a page smaller": (page(2, "/MediaBox", box(0, 0, 595.2756, 400)), "the PDF entry", False),
     "a page trimmed": (page(2, "/TrimBox", box(0, 0, 300, 300)), "an entry /TrimBox", True),
-    "a page in another unit": (page(2, "/UserUnit", N(2)), "another unit", True),
+    "a page in another unit": (page(2, "/UserUnit", N(2)), "a unit of length", True),
     "a page in a group": (page(1, "/Group", dictionary(S=name("Transparency"))),
                           "an entry /Group", True),
     "a thumbnail": (page(1, "/Thumb", image()), "an entry /Thumb", True),
-    "an action of a page": (page(1, "/AA", dictionary()), "an action", True),
+    "an action of a page": (page(1, "/AA", dictionary()), "automatic action", True),
     "a page shown for a second": (page(1, "/Dur", N(1)), "an entry /Dur", True),
     "another parent": (rotated_parent, "a rotation", True),
     "an inherited rotation": (
@@ -475,8 +474,8 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a page more": (kids(lambda k: [*k, k[0]]), "px4fuse draws only 2 pages", False),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
-    "an opening action": (catalogue("/OpenAction", array()), "an action", True),
-    "actions": (catalogue("/AA", dictionary()), "an action", True),
+    "an opening action": (catalogue("/OpenAction", array()), "automatic action", True),
+    "actions": (catalogue("/AA", dictionary()), "automatic action", True),
     "a mode of display": (catalogue("/PageMode", name("FullScreen")), "an entry /PageMode", True),
     "a layout": (catalogue("/PageLayout", name("TwoPageLeft")), "an entry /PageLayout", True),
     "page labels": (
@@ -500,7 +499,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a text in the structure": (
         structure(put("/ActualText", STRING("x"))), "an entry /ActualText", True,
     ),
-    "another attachment": (another_file, "the array /Names has 4 elements", True),
+    "another attachment": (another_file, "the PDF array /Names has 4 elements", True),
     "a description of the attachment": (
         lambda w: w.root_object["/AF"][0].update({NameObject("/Desc"): STRING("x")}),  # type: ignore[index]
         "the PDF entry /Desc is 'x'", False,
@@ -533,7 +532,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
 def test_pdf_comparison_detects_forged_report_page(pdf: bytes, kind: str) -> None:
     forge, said, structural = FORGERIES[kind]
     found = compare(forged(pdf, forge), pdf)
-    assert any(one.what.startswith(said) for one in found), found
+    assert any(said in one.what for one in found), found
     assert any(one.is_structural for one in found) == structural, found
     assert len(found) <= pages.MAX_LISTED_DIFFERENCES + 1
     assert all(one.what.isprintable() and len(one.what) < 200 for one in found)
@@ -588,11 +587,11 @@ def empty_first_page(writer: PdfWriter) -> None:
 
 FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a version appended": (lambda pdf: append_update(pdf, empty_first_page), "drawing operation"),
-    "a table behind the end": (shadowed, "the file has bytes after its end"),
-    "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "the file has bytes after its end"),
+    "a table behind the end": (shadowed, "the file has bytes after the end of the PDF"),
+    "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
     "a table at the beginning": (linearised, "the file has a second table of objects"),
     "a hybrid table": (hybrid, "the file has a second table of objects"),
-    "a later generation": (later_generation, "the PDF entry /Contents is an object of a later"),
+    "a later generation": (later_generation, "/Contents refers to an object of a later"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
     ),
@@ -607,7 +606,7 @@ def test_pdf_comparison_detects_forged_file_structure(pdf: bytes, kind: str) -> 
     made = forge(pdf)
     assert made != pdf
     found = compare(made, pdf)
-    assert any(one.what.startswith(said) for one in found), found
+    assert any(said in one.what for one in found), found
 
 
 def test_pdf_comparison_detects_changed_fill_pattern() -> None:

@@ -173,7 +173,7 @@ def test_ekf2_covariance_of_unknown_length_is_unavailable(read):
     fields["covariances"] = fields["covariances"][:, :22]
     variance = read(log).ekf2.variance
     assert isinstance(variance, Unavailable)
-    assert "estimator_states has unknown array lengths" in variance.reason
+    assert "estimator_states has arrays of unknown length" in variance.reason
 
 
 @pytest.mark.parametrize(("generation", "code", "frame"), [
@@ -537,7 +537,7 @@ def test_data_streams_state_their_topics_clock_and_file(read, generation):
         "ekf2_state": ("vehicle_local_position",), "airborne": ("vehicle_land_detected",),
     }  # fmt: skip
     assert {stream.log for stream in streams.values()} == {"made.ulg"}
-    measured = {part for part, s in streams.items() if s.clock.endswith("at measurement")}
+    measured = {part for part, s in streams.items() if s.clock.endswith("time of measurement")}
     assert measured == {"imu"} | (set() if generation == "v1.9" else {"ekf2_state", *of_ekf2})
 
 

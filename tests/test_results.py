@@ -106,12 +106,12 @@ def test_results_json_rejects_nan_and_infinity():
         (b"[NaN]", "is not JSON"),
         (b"[-Infinity]", "is not JSON"),
         (b"[1e999]", "out of range"),
-        (b"[" + b"9" * 4000 + b"]", "an integer is too large"),
+        (b"[" + b"9" * 4000 + b"]", "an integer has more than 64 bits"),
         (b"[" + b"9" * 1_000_000 + b"]", "out of range"),
         (b'{"schema": {"name": "px4fuse-other", "version": "2.0"}}', "no results of px4fuse"),
         (b'{"schema": {"name": ["px4fuse-results"], "version": 1}}', "no results of px4fuse"),
         (b'{"schema": "px4fuse-results"}', "no results of px4fuse"),
-        (b'[{"a": 1, "b": {}, "a": 2}]', "a key is repeated"),
+        (b'[{"a": 1, "b": {}, "a": 2}]', "a JSON key is repeated"),
         (b"[]", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
         (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "uses schema version 3.0"),
@@ -165,7 +165,7 @@ def test_read_results_ignores_fields_of_newer_minor_version():
 
 @pytest.mark.parametrize(
     ("provenance", "said"),
-    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the px4fuse that wrote it.")],
+    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the version that wrote it.")],
 )
 def test_read_results_of_schema_3_names_px4fuse_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:

@@ -117,7 +117,7 @@ BAD_ROSTERS = {
     "binary": (b"\x00\x01\x02id", "not a text file"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
-    "too long": (b"id\n" + b"1" * 20_000_001, "the limit is"),
+    "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
     "quotes never closed": ('id,name\n1,"Ada\n2,Bob\n', "not a CSV file"),
     "huge cell": ('id,name\n1,"' + "x" * 200_000 + '"\n', "not a CSV file"),
 }  # fmt: skip

@@ -104,7 +104,7 @@ CHECKED = [
      {"setting": "sigma_z_m"}, 1.0, "within"),
     ("tuning", changed_results(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0,
      "too few of them"),
-    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "omit --axis"),
+    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "without --axis"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
@@ -116,31 +116,31 @@ CHECKED = [
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
     ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
-     "omit --axis"),
+     "without --axis"),
     ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
     ("consistent", EXAMPLE, {}, 1.0, "KF is consistent."),
     ("consistent", OVERSTATED, {}, 0.5, "σ of KF is 1.41 times too large"),
     ("consistent", OVERSTATED, {"factor": 1.25}, 0.0, "σ of KF is 1.41 times too large"),
     ("consistent", changed_results(horizontal__kf__verdict="overconfident",
      horizontal__kf__nis_mean=2.0), {}, 0.5, "1.41 times too small"),
-    ("consistent", NORTH, {}, 0.0, "omit --axis"),
+    ("consistent", NORTH, {}, 0.0, "without --axis"),
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "settings do not make KF consistent"),
-    ("clock", EXAMPLE, {}, 1.0, "the estimate is -0.022 to 0.061 s (95 %)"),
+    ("clock", EXAMPLE, {}, 1.0, "interval of the estimate is -0.022 to 0.061 s"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", changed_results(**JUMPS), {}, 0.5, "State the time in your form"),
+    ("clock", changed_results(**JUMPS), {}, 0.5, "State the time of the change"),
     ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
-    ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time in your form"),
+    ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time of the change"),
     ("loop", LOOP, {}, 1.0, "ATE 0.41 → 0.26 m"),
     ("loop", changed_results(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
     ("loop", changed_results(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed_results(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
     ("loop", changed_results(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
-    ("loop", REJECTED, {}, 0.25, "No closure was accepted"),
+    ("loop", REJECTED, {}, 0.25, "No loop closure was accepted"),
     ("loop", changed_results(LOOP, loop__closure_error_m=..., loop__true_end=NONE), {}, 0.0,
      "too few of them"),
     ("number", changed_results(axes__north__updates__count=50), {"path": "axes.*.updates.count",
@@ -187,13 +187,13 @@ class TestForm:
             "you did not name dropout (gap in the position source of this length)"
             in comment.lower()
         )
-        assert "flight does not have yaw" in comment
+        assert "flight does not have: yaw" in comment
 
     @pytest.mark.parametrize(
         ("form", "said"),
         [
             ({}, "report contains no answer form"),
-            ({"log_sha256": "c" * 64}, "was made for another log"),
+            ({"log_sha256": "c" * 64}, "are about different logs"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
         ],
@@ -215,7 +215,7 @@ class TestForm:
     def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, submitter_id, points):
         mistyped = with_form(["dropout"], student__id="s02")
         items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
-        assert [item.points for item in items if "Mistakes" in item.title] == [points]
+        assert [item.points for item in items if "faults" in item.title] == [points]
 
     def test_points_for_student_notes_are_pending_until_graded(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
@@ -253,7 +253,7 @@ class TestScore:
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
-            f"given to student s01, but the {said}"
+            f"assigned to student s01, but the {said}"
             in assess_results(given, key=key()).instructor_action
         )
         for rule, earns in (("zero", False), ("count", True)):
@@ -408,12 +408,12 @@ class TestClassFlags:
              report(7, sha256="y"), report(8, sha256="y")]
         )  # fmt: skip
         assert set(made) == {f"{n}.pdf" for n in (1, 2, 5, 6, 7, 8)}
-        assert "same log as that of Student2" in made["1.pdf"][0]
+        assert "same log as the report of Student2" in made["1.pdf"][0]
         for flag in (flag for flags in made.values() for flag in flags):
             assert re.fullmatch(r"[A-Z].*\.", flag)
             assert flag.isprintable()
-        assert "The id in this report is also in that of" in made["5.pdf"][0]
-        assert "identical to that of" in made["8.pdf"][0]
+        assert "The id in this report is also in the report of" in made["5.pdf"][0]
+        assert "identical to the PDF of" in made["8.pdf"][0]
 
     def test_two_reports_of_one_student_are_flagged_for_their_id(self):
         two = [
@@ -421,8 +421,12 @@ class TestClassFlags:
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),
         ]
         assert flag_equal_contents(two) == {
-            "1.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (b.pdf)."],
-            "b.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (1.pdf)."],
+            "1.pdf": [
+                "The id in this report is also in the report of Student1 Name1, 1001 (b.pdf)."
+            ],
+            "b.pdf": [
+                "The id in this report is also in the report of Student1 Name1, 1001 (1.pdf)."
+            ],
         }
 
     def test_reports_with_similar_answer_forms_are_flagged(self):
@@ -432,7 +436,7 @@ class TestClassFlags:
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = flag_equal_contents([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The answer form has the same numbers as that of" in made["1.pdf"][0]
+        assert "The answer form has the same numbers as the form of" in made["1.pdf"][0]
         # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))

@@ -28,7 +28,7 @@ EXCEPTIONS = {
     '"trusted the positions too little"': "as above",
     '"error to truth"': "as above",
     '"correct the stamps at the sender"': "as above",
-    "time timestamp stamp": "column names of position files",
+    "time,timestamp,stamp": "column names of position files",
     'stamp = "usec"': "field of a table of MAVLink messages",
     "``stamp`` the": "the same field in its docstring",
     "WANDER BIAS IMU": "names of random streams, which determine simulated flights",

@@ -62,7 +62,7 @@ def test_worker_job_that_fails_does_not_affect_other_jobs():
 def test_worker_job_that_hangs_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
-    late = JobFailure("the time limit of 3 s was exceeded.")
+    late = JobFailure("the job exceeded the time limit of 3 s.")
     assert results[0::2] == [late, late]
 
 
@@ -70,7 +70,7 @@ def test_worker_job_that_hangs_ends_at_time_limit():
 def test_worker_job_above_memory_limit_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
-    assert results == [4, JobFailure("the memory limit for one file was exceeded."), 9]
+    assert results == [4, JobFailure("the job exceeded the memory limit for one file."), 9]
     # after a memory error the process is replaced
     jobs = [("process", 0), ("hog", 10 * MEMORY), ("process", 0)]
     (before, _, after), _ = run(jobs, processes=1, memory_bytes=MEMORY)

@@ -90,7 +90,7 @@ def test_output_to_socket_is_refused_and_keeps_the_socket(desk) -> None:
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind("socket")
         said = error_line("info", "l.ulg", "--json", "socket")
-        assert said.startswith("socket: cannot be written")
+        assert said.startswith("socket cannot be written")
         assert (desk / "socket").is_socket()
 
 
@@ -104,7 +104,7 @@ def test_output_to_symbolic_link_replaces_its_target(tmp_path) -> None:
         assert (tmp_path / target).read_bytes() == link.encode()
     assert names(tmp_path) == ["a", "b", "c", "new", "old"]
     (tmp_path / "round").symlink_to("round")
-    with pytest.raises(OutputError, match="round: cannot be written"):
+    with pytest.raises(OutputError, match="round cannot be written"):
         write_all({tmp_path / "round": b""})
 
 
@@ -156,7 +156,8 @@ def test_write_error_lists_the_files_already_written(tmp_path, monkeypatch) -> N
     placed: list[Path] = []
     with pytest.raises(OutputError) as caught:
         write_all(dict.fromkeys((a, b, c), b"new"), placed.append)
-    said = f"{b}: cannot be written (Permission denied); already written: {a}. Choose another name."
+    said = f"{b} cannot be written (Permission denied); outputs already written: {a}. "
+    said += "Choose another output name."
     assert str(caught.value) == said
     assert placed == [a]
     assert contents(tmp_path) == {"a": b"new", "b": b"old", "c": b"old"}
@@ -215,7 +216,7 @@ def test_stop_signal_while_writing_lists_the_written_files(desk, name, code) -> 
     process.send_signal(number)
     out, err = process.communicate(timeout=30.0)
     assert (process.returncode, out) == (code, b"")
-    assert err == b"px4fuse: interrupted; already written: c.tum.\n"
+    assert err == b"px4fuse: interrupted; outputs already written: c.tum.\n"
     assert names(desk) == ["c.tum", "l.ulg", "pipe", "s.tum"]
 
 
@@ -252,7 +253,7 @@ def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, ca
 
     monkeypatch.setattr(screen, "show", stopped)
     code, _, err = run_main(monkeypatch, capsys, *LOOP, "--json", "c.json")
-    assert (code, err) == (130, "px4fuse: interrupted; already written: c.tum, c.json.\n")
+    assert (code, err) == (130, "px4fuse: interrupted; outputs already written: c.tum, c.json.\n")
     assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]
 
 
@@ -263,8 +264,8 @@ def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, ca
 @pytest.mark.parametrize(
     ("json_path", "left", "there"),
     [
-        ("-", "; already written: c.tum.", ["c.tum"]),
-        ("c.json", "; already written: c.tum, c.json.", ["c.json", "c.tum"]),
+        ("-", "; outputs already written: c.tum.", ["c.tum"]),
+        ("c.json", "; outputs already written: c.tum, c.json.", ["c.json", "c.tum"]),
     ],
 )
 def test_full_disk_at_standard_output_lists_the_written_files(desk, json_path, left, there) -> None:
@@ -272,7 +273,7 @@ def test_full_disk_at_standard_output_lists_the_written_files(desk, json_path, l
         process = start(desk, *LOOP, "--json", json_path, stdout=device)
         err = process.communicate()[1].decode()
     assert process.returncode == 2
-    said = "px4fuse: standard output: cannot be written (No space left on device)"
+    said = "px4fuse: standard output cannot be written (No space left on device)"
     assert err.startswith(f"{said}{left}")
     assert len(err.splitlines()) == 1
     assert names(desk) == [*there, "l.ulg", "s.tum"]
@@ -289,7 +290,7 @@ def test_json_to_closed_pipe_still_writes_the_other_files(desk) -> None:
 
 def test_output_to_existing_folder_name_is_refused(tmp_path, capsysbinary) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError, match=r"folder: cannot be written \(Is a directory\)"):
+    with pytest.raises(OutputError, match=r"folder cannot be written \(Is a directory\)"):
         write_all({tmp_path / "folder": b"", STANDARD_OUTPUT: b"{}"})
     assert capsysbinary.readouterr().out == b""
     write_all({tmp_path / "a": b"", STANDARD_OUTPUT: b"{}"})
@@ -399,5 +400,5 @@ def test_output_to_pipe_without_reader_ends_after_timeout(
     monkeypatch.setattr("px4fuse.core.writing.READER_TIMEOUT_S", 0.1)
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
-    assert "the pipe has no reader" in error_line("info", sample_log, "--json", pipe)
+    assert "no program reads the pipe" in error_line("info", sample_log, "--json", pipe)
     assert "is not a file or folder" in error_line("grade", pipe, "-o", tmp_path / "out")

@@ -17,7 +17,9 @@ MAX_SPAN_S = 7200.0
 def explain_mismatch(
     flight: Flight, problem: AlignmentProblem, metres_per_unit: float = 1.0
 ) -> tuple[str, str] | None:
-    """Return the fault of a file's axes or unit, and the action; None if the motion shows none.
+    """Find an error of the axes or the unit of a position file, and an action for it.
+
+    Return None if the motion of the flight shows no such error.
 
     Parameters
     ----------

@@ -26,12 +26,13 @@ MAX_SPAN_S = 86400.0
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
-# Minimum ratio of the residual in the second best frame to the residual in the best frame
+# Minimum ratio of the residual in the second best frame to the residual in the best frame, for
+# accepting the best frame
 MIN_FRAME_RATIO = 1.3
 # Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
-# for a frame that is misaligned
+# to report a misaligned frame
 MIN_ROTATION_RATIO = 2.0
-# Minimum residual (m, RMS) with the user's yaw, for a frame that is misaligned
+# Minimum residual (m, RMS) with the user's yaw, to report a misaligned frame
 MIN_ROTATION_RMS_M = 0.3
 
 
@@ -68,7 +69,7 @@ class Match:
     residuals_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
-        Fit with the yaw of the user; without it, with estimated yaw.
+        Fit with the yaw of the user, or with estimated yaw if the user gave none.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool
@@ -84,12 +85,12 @@ class Match:
 
     @property
     def time_offset_fit(self) -> Fit:
-        """Fit from which the time offset is used."""
+        """Fit that determines the time offset of the file."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
     def residuals_text(self) -> str:
-        """Residual in each frame, as text."""
+        """Residuals for messages, best frame first: "ned 0.12 m, enu 3.40 m"."""
         return ", ".join(
             f"{name} {residual_m:.2f} m" for name, residual_m in self.residuals_m.items()
         )
@@ -137,7 +138,9 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     samples = problem.samples
     yaw_rad = problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
-        raise NoMatchError("the position file is longer than one day; cut the file to the flight")
+        raise NoMatchError(
+            "the position file covers more than one day; shorten the file to the flight"
+        )
     if tracks.horizontal_range_m(tracks.convert_to_ned(samples, "ned")) < tracks.MIN_MOTION_M:
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
@@ -163,14 +166,17 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Return True if estimating yaw and origin reduces the residual by MIN_ROTATION_RATIO."""
+    """Return True if estimating yaw and origin reduces the residual by MIN_ROTATION_RATIO.
+
+    ``horizontal_rms_m`` is the residual (RMS per axis) with the yaw of the user.
+    """
     return horizontal_rms_m > MIN_ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
         horizontal_rms_m > MIN_ROTATION_RMS_M or reference == IMU
     )
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Return True if the tracks agree well, and no other lag fits as well."""
+    """Return True if file and reference agree well, and do not at another time offset."""
     return (
         fit.concordance >= GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
@@ -187,26 +193,28 @@ def _check_match(match: Match) -> None:
         )
     ambiguity = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
-        ambiguity = f"two offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
+        ambiguity = (
+            f"two time offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
+        )
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        ambiguity = f"its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s"
+        ambiguity = f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
     if ambiguity:
         raise NoMatchError(
-            f"the time offset against the {name} cannot be estimated: {ambiguity}",
+            f"the time offset between position file and {name} cannot be estimated: {ambiguity}",
             "Give `clock_offset_s`",
         )
     if len(match.residuals_m) > 1:
         best_m, second_m = (np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2])
         if second_m < MIN_FRAME_RATIO * best_m:
             raise NoMatchError(
-                f"the frame cannot be estimated, because the residuals against the {name} are "
-                f"similar ({match.residuals_text})",
+                "the frame of the position file cannot be estimated, because several frames have "
+                f"similar residuals against the {name} ({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
             )
 
 
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Repeat the fit to EKF2 with EKF2's resets removed as in the comparison of EKF2 and file."""
+    """Repeat the fit to EKF2 without the resets that the comparison with the file removes."""
     ekf2 = flight.ekf2
     fit = match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
@@ -229,13 +237,19 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    """Find the lag by correlation, unless the user gave it; then fit by least squares."""
+    """Fit a position file to a reference by least squares.
+
+    Unless the user gave the lag, the fit starts at the lag with the maximum correlation.
+    """
     track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
     if reference.name == IMU:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
-            raise NoMatchError("the position file is too short for a match with the IMU")
+            raise NoMatchError(
+                f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
+                "match with the IMU"
+            )
         position_m = tracks.band_pass(tracks.band_pass(grid_track.position_m))
         track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:

@@ -86,13 +86,14 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name} contains {len(samples)} positions; at least "
             f"{tracks.MIN_SAMPLES} are needed",
-            "Check the position file.",
+            "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
     boot_s = flight.log.boot_time_s
     spans_text = (
-        f"log {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot clock, file "
-        f"{start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
+        f"the log is from {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot "
+        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} "
+        "clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
@@ -111,12 +112,12 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
-    yaw_reason = "given with --position-yaw"
+    yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
-        yaw_reason = "assumed: the file has the yaw of EKF2's frame"
-    frame_reason = "from the column names of the file"
+        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
+    frame_reason = "according to the column names of the position file"
     if frame:
-        frame_reason = "given with --position-frame"
+        frame_reason = "the frame was given with --position-frame"
     alignment, aligned_samples = _describe_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
@@ -126,12 +127,12 @@ def align_position_file(
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
-        description=f"external position file, {len(aligned_samples)} samples, {alignment.frame}"
-        f"{rotation_text}",
+        description=f"position file with {len(aligned_samples)} samples in the frame "
+        f"{alignment.frame}{rotation_text}",
         samples=aligned_samples,
         frame="NED",
-        clock=f"{recording.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
-        f"clock, {clock_source}",
+        clock=f"{recording.clock} clock of the position file; boot clock minus this clock: "
+        f"{alignment.clock_offset_s:+.3f} s, {clock_source}",
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
@@ -154,7 +155,10 @@ def align_position_file(
 
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
-    """Describe the file's clock if most rows share a timestamp; None for any other clock."""
+    """Describe the clock of a file in which most rows repeat a timestamp.
+
+    Return None for any other file.
+    """
     distinct = len(recording.samples)
     count = distinct + recording.dropped
     if distinct > MAX_DISTINCT_FRACTION * count:
@@ -167,10 +171,11 @@ def _check_options(
 ) -> None:
     if frame not in (None, *tracks.FRAMES):
         raise SettingsError(
-            f"`frame` {frame} is not valid.", f"Use one of {', '.join(tracks.FRAMES)}."
+            f"`frame` {frame} is not a known coordinate frame.",
+            f"Use one of {', '.join(tracks.FRAMES)}.",
         )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
-        raise SettingsError(f"`yaw_deg` {yaw_deg} is not valid: give degrees or auto.")
+        raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
         if isinstance(value, float) and not np.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
@@ -193,14 +198,15 @@ def _describe_alignment(
     yaw_sigma_deg = clock_sigma_s = correlation = residual_rms_m = None
     origin_m = np.zeros(3)
     reference = ""
-    clock_reason = "given with --clock-offset"
+    clock_reason = "the offset was given with --clock-offset"
     if match:
         frame = match.frame
         reference = match.reference.name
         if problem.frame is None:
             frame_reason = f"smallest residual against {reference} ({match.residuals_text})"
             if is_yaw_free and frame == "enu":
-                frame_reason += "; nwu differs from enu only in yaw, which was estimated"
+                nwu_note = "nwu differs from enu only in yaw, which was estimated"
+                frame_reason = f"{frame_reason}; {nwu_note}"
         if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
@@ -210,7 +216,7 @@ def _describe_alignment(
             lag_s = match.time_offset_fit.lag_s
             clock_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
-            clock_reason = f"estimated against {reference}; includes the delay of {reference}"
+            clock_reason = f"estimated against {reference}, including the delay of {reference}"
         correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
@@ -229,7 +235,7 @@ def _describe_alignment(
     ):
         warnings.append(
             f"The position file does not match the EKF2 position (correlation {correlation:.2f}). "
-            "Check time offset, frame and yaw."
+            "Check time offset, frame and yaw of the position file."
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
@@ -237,7 +243,7 @@ def _describe_alignment(
         if difference_s >= MAX_UNIX_DIFFERENCE_S:
             warnings.append(
                 f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
-                "that both are of the same flight."
+                "that both files are of the same flight."
             )
     alignment = Alignment(
         frame=frame,
@@ -261,10 +267,10 @@ def _describe_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) of the file from EKF2, and the correlation of the tracks.
+    """Return the horizontal distances (m) of file and EKF2, and the correlation of both tracks.
 
-    The correlation is None if EKF2 hardly moves. The result is None if EKF2 has no position at the
-    times of the file.
+    The correlation is None if EKF2 hardly moves. Return None if EKF2 has no position at the times
+    of the file.
     """
     if isinstance(flight.ekf2, Unavailable):
         return None
@@ -290,9 +296,10 @@ def _compare_with_ekf2(
 
 
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
-    """Return the sentence that the frame of the file is rotated; "" if it is not rotated.
+    """Return a sentence on the rotation of the file's frame against the reference.
 
-    ``distance_m`` is the distance from EKF2, None if the file is not compared with EKF2.
+    ``distance_m`` is the horizontal distance from EKF2, or None if the file is not compared with
+    EKF2. Return an empty string if the frame is not rotated.
     """
     if match is None:
         return ""
@@ -303,13 +310,14 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     if distance_m is not None:
         rms_m = truncated_rms(distance_m) / np.sqrt(2.0)
         is_rotated = matching.is_good_fit(fit, name) and matching.needs_rotation(rms_m, fit, name)
-        shift_text = f" and shifted by {np.hypot(*fit.origin_m[:2]):.1f} m"
+        shift_m = np.hypot(*fit.origin_m[:2])
+        shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
     return (
-        f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} against the {name}. "
-        "Give --position-yaw auto."
+        f"The frame of the position file is rotated by {yaw_deg:.1f}° against the {name}. "
+        f"{shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
 
 
@@ -326,8 +334,8 @@ def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:
     if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
         yield (
             f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: the "
-            f"residual is {fit.second_peak_ratio:.1f} times larger. Check the offset, or give "
-            "--clock-offset."
+            f"residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or set "
+            "the time offset with --clock-offset."
         )
     if is_yaw_free and name == IMU:
         yield (

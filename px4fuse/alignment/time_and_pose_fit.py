@@ -16,12 +16,12 @@ MAX_LAG_SHIFT_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Minimum of 1 minus the concordance coefficient in the likelihood: with it, the longest of several
-# nearly perfect matches has the greatest likelihood
+# Minimum value of 1 minus the concordance coefficient in the likelihood, so that the longest of
+# several nearly perfect matches has the greatest likelihood
 MIN_DISCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
-# Residual (m) of a perfect match that the time grid causes
+# Residual (m) that the time grid causes even if both tracks match perfectly
 GRID_RESIDUAL_M = 0.05
 # Maximum residual (m): larger residuals are truncated, because they may be outliers
 MAX_RESIDUAL_M = 1.0
@@ -84,7 +84,9 @@ class Fit(CorrelationPeak):
 def find_correlation_peak(
     file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
 ) -> CorrelationPeak:
-    """Find the lag at which the file matches the reference best; also estimate yaw if it is None.
+    """Find the lag at which a position file matches a reference best.
+
+    The yaw is also estimated if ``yaw_rad`` is None.
 
     With a free origin the residual sum of squares of file f and reference g over an overlap of N
     grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus the
@@ -98,7 +100,7 @@ def find_correlation_peak(
         No lag has sufficient overlap.
     """
     if not file_track.is_valid.any() or not reference.is_valid.any():
-        raise NoMatchError("the tracks have too few samples between gaps for a match")
+        raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = moments(
         file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
     )
@@ -110,8 +112,8 @@ def find_correlation_peak(
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, min_count / 2.0)
     )
     if not has_overlap.any():
-        raise NoMatchError("the tracks have too few samples between gaps for a match")
-    has_overlap &= power > 1e-9 * np.max(power)  # exclude rounding errors
+        raise NoMatchError("position file and reference have too few common samples for a match")
+    has_overlap &= power > 1e-9 * np.max(power)  # at rest, the variance is a rounding error
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
@@ -140,7 +142,7 @@ def find_correlation_peak(
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
-    # Residual (m) per axis; with GRID_RESIDUAL_M added, two perfect matches are equally good
+    # Residual (m) per axis; GRID_RESIDUAL_M makes two perfect matches equally good
     mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
@@ -176,13 +178,15 @@ def fit_by_least_squares(
     is_used = is_known & file_track.is_valid
     if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
-            f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
+            f"only {np.count_nonzero(is_used)} positions of the file are within the time of the "
+            "reference"
         )
     time = file_track.time_s[is_used] + peak.lag_s
     file_m = file_track.horizontal_m[is_used]
     target_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_m)
-    file_m = file_m - centre_m  # makes yaw and origin uncorrelated
+    # with a centred track, the errors of yaw and origin are uncorrelated
+    file_m = file_m - centre_m
     power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
     coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
     mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0

@@ -31,9 +31,9 @@ MIN_GAP_LIMIT_S = 0.5
 MIN_MOTION_M = 0.5
 # Minimum number of positions for a match
 MIN_SAMPLES = 10
-# Minimum overlap (s) of two tracks for a match; of short tracks, half of the shorter one
+# Minimum overlap (s) of two tracks for a match, or half of the shorter track if that is less
 MIN_OVERLAP_S = 10.0
-# σ (s) of the Gaussian filter without delay that smooths EKF2's steps at updates
+# σ (s) of the Gaussian filter that smooths the steps of EKF2's position at updates
 SMOOTHING_S = 0.2
 # Frequency band in which acceleration integrated twice equals position; at lower frequencies the
 # integral drifts
@@ -82,14 +82,17 @@ class SampledTrack:
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Interpolate the position; also return a mask of the times outside of gaps."""
+        """Interpolate the position at times; also return a mask of the times outside of gaps."""
         position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
         return np.stack(position, axis=1), is_valid
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Convert a position file to north, east, down; times count from the first sample."""
+    """Convert the positions of a file to north, east, down.
+
+    The times count from the first sample.
+    """
     order, sign = FRAMES[frame]
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
     return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position)
@@ -100,7 +103,10 @@ def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample a track to a regular time grid; samples inside gaps are invalid."""
+    """Resample a track to a regular time grid.
+
+    Samples inside gaps are marked as invalid.
+    """
     grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
     is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
     return SampledTrack(grid, track.at(grid)[0], is_known)
@@ -136,7 +142,7 @@ def horizontal_range_m(track: SampledTrack) -> float:
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     finite_state = finite_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
-        raise NoMatchError("no horizontal EKF2 position in the log")
+        raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
     position_m = finite_state[Columns.POSITION].to_numpy()
     grid = resample_to_grid(_track_without_gaps(finite_state.index.to_numpy(), position_m))
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
@@ -144,7 +150,7 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """Return EKF2's published position and, if it has horizontal resets, also without these resets.
+    """Return EKF2's published position, and a copy without horizontal resets if there are any.
 
     Height resets are not removed, because most of them correct an error from before take-off.
     """
@@ -172,7 +178,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
     grid = resample_to_grid(_track_without_gaps(time, velocity))
     if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
-        raise NoMatchError("the IMU data are too short")
+        raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
     position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
     return [mark_transients(replace(grid, position_m=band_pass(position), name=IMU))]
 
@@ -189,7 +195,7 @@ def align_samples(
     position = track.position_m
     order, _ = FRAMES[frame]
     variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
-    if yaw_rad:  # without rotation, a missing sigma of one axis does not make the other missing
+    if yaw_rad:  # a rotation mixes both axes, so both sigmas are then needed
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         rotation = np.array([[c, -s], [s, c]])
         position[:, :2] = position[:, :2] @ rotation.T
@@ -202,7 +208,7 @@ def align_samples(
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track without the resets that the comparison with the aligned file removes."""
+    """Return EKF2's track without the resets that the comparison with the file removes."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

@@ -29,9 +29,9 @@ SETTING_LABELS = {
     "SIGMA_Z (m)": "settings.sigma_z_m",
     "DT (s)": "settings.dt_s",
     "input": "settings.input",
-    "added time offset (s)": "settings.clock_offset_s",
-    "start of the analysis (s)": "settings.start_s",
-    "end of the analysis (s)": "settings.end_s",
+    "time offset added to the source (s)": "settings.clock_offset_s",
+    "start of the analysed time (s)": "settings.start_s",
+    "end of the analysed time (s)": "settings.end_s",
     "position source": "source.name",
     "firmware": "log.firmware",
     "firmware hash": "log.firmware_hash",
@@ -138,7 +138,7 @@ def compare_numbers(
 
 
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Yield the findings that only A or only B contains with the same id and severity."""
+    """Yield the findings whose id and severity occur in the results of only A or only B."""
     sides: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
     for results, other_results, only_in in sides:
         ids = {(finding.id, finding.severity) for finding in other_results.findings}
@@ -150,7 +150,7 @@ def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]
 def _worse_verdicts(
     a: Results, b: Results, findings: Iterable[contract.FindingChange]
 ) -> Iterator[str]:
-    """Yield a sentence for each verdict that is worse in B, and for each new error finding."""
+    """Yield a sentence on each verdict that is worse in B, and on each error that only B has."""
     verdicts_a, verdicts_b = _verdicts_by_axis(a), _verdicts_by_axis(b)
     for name, (value_a, was_consistent) in verdicts_a.items():
         value_b, is_consistent = verdicts_b.get(name, (value_a, True))
@@ -172,7 +172,7 @@ def _worse_verdicts(
 
 
 def _verdicts_by_axis(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return mean NIS and mean NEES by label ("Mean NIS of KF, north"), with True if consistent."""
+    """Return mean NIS or NEES, and True if consistent, by label such as "Mean NIS of KF, north"."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
         for name, label in FILTER_LABELS.items():

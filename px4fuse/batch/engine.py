@@ -78,11 +78,9 @@ def _check_workers(client: Client) -> None:
     own_version = metadata.version("px4fuse")
     for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
         if worker_version != own_version:
-            worker_text = (
-                f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
-            )
+            found = worker_version if isinstance(worker_version, str) else "missing"
             raise SettingsError(
-                f"Dask worker {name} has {worker_text}; this computer has px4fuse {own_version}.",
+                f"px4fuse version: {found} on Dask worker {name}, {own_version} on this computer.",
                 "Install the same version of px4fuse on the worker and on this computer.",
             )
 
@@ -100,7 +98,7 @@ def run_jobs(
     client : Client or None
         Client of a cluster; None for processes of this computer.
     work : callable
-        :func:`~px4fuse.core.workers.run_bounded` with its function and limits.
+        Function that runs a list of jobs: :func:`~px4fuse.core.workers.run_bounded` with limits.
     processes : int, optional
         Number of parallel processes on this computer; default: number of cores.
 

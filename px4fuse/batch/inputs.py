@@ -62,12 +62,8 @@ def _read_attached(path: Path) -> DiffInput | None:
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return None
     limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
-    advice = (
-        "Give a report, which has less than 2 MB"
-        if is_report
-        else "Give results of px4fuse compare"
-    )
-    content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
+    remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
+    content = read_bytes_limited(path, ResultsError, limit, size_remedy=remedy)
     results = (attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(

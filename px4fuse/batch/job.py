@@ -84,7 +84,7 @@ def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
-    # imported here, because only the worker processes need these modules
+    # imported here, because only worker processes need these modules
     from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
     from px4fuse.results.build import log_record, results  # noqa: PLC0415

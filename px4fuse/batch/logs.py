@@ -86,7 +86,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             info_by_path = {
                 path: info for path, info in all_files.items() if info["type"] == "file"
             }
-    # OSError, or an exception of the package for this type of URL (unknown account or bucket)
+    # OSError, or for URLs an exception of another package (unknown account or bucket)
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
@@ -139,8 +139,8 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         file_system, path = url_to_fs(address)
-    except ImportError as error:  # the cause of the error names the missing package
-        package = getattr(error.__cause__, "name", None) or "the package of this type of URL"
+    except ImportError as error:  # __cause__ is the error that names the missing package
+        package = getattr(error.__cause__, "name", None) or "fsspec[full]"
         raise SettingsError(
             f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
         ) from error

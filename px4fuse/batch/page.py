@@ -86,7 +86,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     ]
     return frame.page(
         title=title,
-        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}. Compared with {made_with}.",
+        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}. Compared by {made_with}.",
         html_above=load_template("batch/axis.html").render(limits=band_limits()),
         noun=("log", "logs"),
         columns=(
@@ -114,7 +114,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         filters=_page_filters(logs),
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
-        full_table_note="All rows are in fleet.csv.",
+        full_table_note="The table fleet.csv contains all rows.",
         ratio_axis={"bands": SIGMA_RATIO_BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )
 
@@ -211,7 +211,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the page filters with their options and log counts, most frequent option first."""
+    """Return each page filter with its options and their log counts, most frequent first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()

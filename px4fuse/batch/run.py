@@ -39,7 +39,7 @@ from px4fuse.request import ComparisonRequest, command_line
 
 # Table columns with the paths of a log's outputs, relative to the output folder
 FILE_COLUMNS = ("results", "report")
-RESUME_NOTE = "Finished results are kept. Run the same command to continue."
+RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
 Progress = Callable[[str, int, int], None]
 
@@ -124,7 +124,7 @@ def run_batch(
     memory_gb : float
         Maximum address space for one log, of which libraries use 0.6 GB; only on Linux.
     progress : callable
-        Function of the activity, the number of finished logs, and the number of all logs.
+        Called with the activity, the number of finished logs, and the number of all logs.
     **settings
         The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
@@ -165,7 +165,7 @@ def run(
     progress: Progress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
-    """Compare many logs as :func:`batch` does, and write table and results to a folder.
+    """Compare many logs as :func:`run_batch` does, and write table and results to a folder.
 
     If the run ends early (Ctrl-C, full disk, lost cluster), the folder contains the finished
     results, and a table of them if the table can be written.
@@ -173,7 +173,7 @@ def run(
     Raises
     ------
     SettingsError
-        See :func:`batch`.
+        See :func:`run_batch`.
     OutputError
         A result cannot be written.
     Px4FuseError
@@ -190,9 +190,9 @@ def run(
     except TypeError as error:
         raise SettingsError(f"a setting is unknown ({error}).") from error
     if request.position is not None:
-        raise SettingsError("`position` is the file of one flight and not possible for many logs.")
+        raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    # not used; raises SettingsError if a setting is out of range
+    # raises SettingsError if a setting is out of range
     Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
@@ -294,10 +294,10 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
         first_log = state.first_log_by_hash[sha256]
         if first_log is log and sha256 in rows_by_hash:
             return rows_by_hash[sha256]
-        status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}, see its rows"
+        status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}"
         if first_log is log:
             status = FAILED
-            reason = "another px4fuse batch with this output folder replaced the rows of this log"
+            reason = "another run of px4fuse batch replaced the rows of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:

@@ -16,9 +16,7 @@ from px4fuse.results.contract import ChangeResults, Interval
 if TYPE_CHECKING:
     from px4fuse.batch.run import BatchResult
 
-# Maximum number of reasons for missing results that the summary lists
 MAX_LISTED_REASONS = 8
-# Maximum number of logs that the summary lists
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
@@ -55,8 +53,10 @@ def format_summary(batch_result: BatchResult) -> Page:
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
-    reused_text = f"{batch_result.reused_count} reused from an earlier run"
-    page.write(f"{len(logs)} logs: {status_counts}; {reused_text}.{retry_note}")
+    page.write(
+        f"{len(logs)} logs: {status_counts}; from an earlier run: {batch_result.reused_count}."
+        f"{retry_note}"
+    )
     return page
 
 

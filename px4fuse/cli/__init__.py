@@ -19,12 +19,12 @@ from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
 
 # Help text of each command; --help does not import the modules of the commands, which is slow
 COMMANDS = {
-    "compare": "Check EKF2 against a two-state Kalman filter and report mistakes.",
+    "compare": "Check EKF2 against a two-state Kalman filter and report faults.",
     "batch": "Compare KF and EKF2 on many logs and write one table.",
     "diff": "List differences between two flights or reports.",
     "answers": "Write the answer form of a student for a flight.",
     "explore": "Write an interactive page with sliders for the filter settings.",
-    "practice": "Write a quiz page with simulated flights and hidden mistakes.",
+    "practice": "Write a quiz page with simulated flights and injected faults.",
     "info": "List the contents of a log and which analyses are possible.",
     "explain": "Explain a finding: meaning, example, action, false alarms.",
     "extract": "Export a log as tables (CSV or Parquet).",
@@ -33,7 +33,7 @@ COMMANDS = {
     "whatif": "Replay EKF2 with changed parameters.",
     "loop": "Measure and correct the loop closure error of odometry.",
     "evaluate": "Compute ATE and RPE of a trajectory against a reference.",
-    "simulate": "Simulate a flight with known ground truth and chosen mistakes.",
+    "simulate": "Simulate a flight with ground truth and injected faults.",
     "verify": "Verify that the numbers of a report follow from its log.",
     "grade": "Verify and grade the reports of a class.",
     "sample": "Write the sample logs (aisle with UWB, loop with VIO).",
@@ -55,12 +55,12 @@ IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# Commands that need pyarrow; in all other runs pandas must not import pyarrow, which takes 70 MB
+# Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
 PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
-    """Group that imports a command only when it is called."""
+    """Group of click that imports a command only when the command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -102,7 +102,7 @@ class LazyGroup(click.Group):
         except BrokenPipeError as error:
             # the new error has no errno, because click ends the command with exit code 1 for EPIPE
             raise BrokenPipeError from error
-        except KeyboardInterrupt as interrupt:  # otherwise click prints an empty line
+        except KeyboardInterrupt as interrupt:  # click would print an empty line
             raise Interrupted(interrupt, written_so_far(ctx)) from None
         except MemoryError as error:
             raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
@@ -171,7 +171,7 @@ def main() -> None:
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _interrupt)
-    if hasattr(signal, "pthread_kill"):  # Windows has no such function
+    if hasattr(signal, "pthread_kill"):  # Windows does not have it
         sys.unraisablehook = _interrupt_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
@@ -193,7 +193,7 @@ def main() -> None:
     except BrokenPipeError:  # the program that reads the pipe has ended
         _abandon_output()
         exit_code = 0
-    except OSError as error:  # click printed --help or --version
+    except OSError as error:  # click cannot print --help or --version
         _print_error(f"standard output: cannot be written ({error.strerror}); nothing was written.")
         exit_code = 2
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
@@ -215,7 +215,7 @@ def _flush_output(exit_code: int) -> int:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output()
-        if exit_code == 0:  # for another exit code, an error is already printed
+        if exit_code == 0:  # with another exit code, px4fuse has already printed an error
             _print_error(f"standard output: cannot be written ({error.strerror}).")
             return 2
     return exit_code
@@ -260,7 +260,7 @@ def _interrupt_again(ignored: "sys.UnraisableHookArgs") -> None:
     error = ignored.exc_value
     if isinstance(error, KeyboardInterrupt):
         number = error.args[0] if error.args else signal.SIGINT
-        # after 0.1 s the finaliser has ended; the signal also ends a wait of the main thread
+        # after 0.1 s the finaliser has ended; a signal also ends a blocking call of the main thread
         threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, number]).start()
     else:
         sys.__unraisablehook__(ignored)

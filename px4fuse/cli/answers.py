@@ -15,8 +15,8 @@ from px4fuse.cli.outputs import write_new
 def answers(log: Path, output: Path | None) -> None:
     """Write the answer form of a student for a flight.
 
-    The form contains questions on the mistakes of the flight, the behaviour of EKF2, and three
-    numbers. Complete the form and give it to px4fuse compare --answers.
+    The form contains questions on injected faults, the behaviour of EKF2, and three numbers.
+    Complete the form and give it to px4fuse compare --answers.
     """
     from px4fuse.core.reading import read_log_bytes
     from px4fuse.results.answer_form import form_name, form_text

@@ -70,7 +70,7 @@ def batch(
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
     fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes
-    only new and failed logs. Ctrl-C keeps finished results.
+    only new and failed logs. After Ctrl-C the results of finished logs are kept.
     """
     if scheduler in CLUSTERS:
         click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
@@ -93,7 +93,7 @@ def batch(
                 **option_values,
             )
     except KeyboardInterrupt as interrupt:
-        message = f"finished results are in {output}. Run the same command to continue."
+        message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print({}, format_summary(fleet), written_files=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()

@@ -47,11 +47,11 @@ def compare(
     quiet: bool,
     **option_values: Any,
 ) -> None:
-    """Check EKF2 against a two-state Kalman filter and report mistakes.
+    """Check EKF2 against a two-state Kalman filter and report faults.
 
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Runs a two-state Kalman filter
     (KF) on the IMU and position data, and compares its innovations and variances with EKF2. Lists
-    mistakes and how to fix them. Writes a PDF report and the results as JSON, for example
+    faults and their corrections. Writes a PDF report and the results as JSON, for example
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks

@@ -67,13 +67,13 @@ def _finding_page(finding_id: str) -> Page:
 def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:
     if not clean_flights:
         return [
-            "No rates are measured, because this finding states a property of the log or a setting."
+            "Detection is not measured: this finding states a property of the log or a setting."
         ]
     detected = "; ".join(
         f"{mistake}: {100.0 * fraction:.0f} %" for mistake, fraction in detection.items()
     )
     return [
-        f"False alarms occurred on {false_alarms} of {clean_flights} simulated flights without a "
-        "mistake.",
-        f"Fraction of simulated flights on which the mistake is detected: {detected}.",
+        f"False alarms occurred on {false_alarms} of {clean_flights} simulated flights without an "
+        "injected fault.",
+        f"Fraction of simulated flights on which the injected fault is detected: {detected}.",
     ]

@@ -174,7 +174,7 @@ def grade(
                 progress=partial(show_progress, "grading"),
             )
     except KeyboardInterrupt as interrupt:
-        message = f"finished results are in {output}. Run the same command to continue."
+        message = f"results of verified reports are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
     write_and_print({}, _page(outcome), written_files=outcome.written_paths)
 
@@ -218,8 +218,8 @@ def _page(outcome: GradeOutcome) -> Page:
     missing_count = sum(entry.counted_report is None for entry in outcome.entries)
     page.write(
         f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.entries)} students; {outcome.reused_count} submissions "
-        "were verified in an earlier run"
+        f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
+        f"{outcome.reused_count} submissions"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

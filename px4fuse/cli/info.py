@@ -60,7 +60,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     check_targets([json_path])
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
-        show_progress("reading the contents")
+        show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
     write_and_print(contents, _page(inventory, request))
@@ -124,7 +124,7 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
         count = len(log.dropouts)
-        text = f"{count} logger dropouts, {lost_s:.2f} s in total, the longest {longest_s:.2f} s"
+        text = f"{count} logger dropouts: total {lost_s:.2f} s, longest {longest_s:.2f} s"
         labelled_texts.append(("Dropouts", text))
     labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
@@ -134,7 +134,11 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
 
 
 def _duration_text(seconds: float) -> str:
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "all data have the same time"
+    return (
+        f"{seconds:.{1 if seconds >= 1 else 3}f} s"
+        if seconds
+        else "all samples have the same timestamp"
+    )
 
 
 def _start_text(inventory: Inventory) -> str:
@@ -173,7 +177,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            # the table of analyses contains the reason for the missing data
+            # another table contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
             continue
         yield (

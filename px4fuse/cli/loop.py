@@ -24,7 +24,7 @@ from px4fuse.request import (
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Maximum distance (m) for --landed-at: longer than any tape measure
+# Maximum distance (m) of the landing place (--landed-at): longer than any tape measure
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters of the command that are allowed if SOURCE is a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
@@ -110,14 +110,14 @@ def parse_closure(text: str) -> GivenClosure:
     "position_drift_m",
     type=options.TypedQuantity("m", 1.0),
     default=1.0,
-    help="Position drift (m, 1 σ) of the odometry after 100 m, which weights it in the pose graph.",
+    help="Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
 @click.option(
     "--heading-drift",
     "heading_drift_deg",
     type=options.TypedQuantity("°", 3.0),
     default=3.0,
-    help="Heading drift (°, 1 σ) of the odometry after 100 m, which weights it in the pose graph.",
+    help="Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
 @click.option(
     "--key-frames",
@@ -171,7 +171,7 @@ def loop(
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
-                f"{name} -: only --json can write to standard output", "Give a file name."
+                f"{name} cannot write to standard output, only --json can", "Give a file name."
             )
     if is_g2o(split_part(str(source))[0]):
         _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
@@ -210,7 +210,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
         best_path = loop_result.best
         if best_path is loop_result.odometry:
             raise MissingDataError(
-                f"--tum {display_name(tum)}: no corrected path exists, as no loop closure was "
+                f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "
                 "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
         contents[tum] = tum_text(

@@ -131,8 +131,7 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
-# Size limit of logs: not part of a request, because the limit depends on the computer and does not
-# affect results
+# The size limit of logs is not part of a request, because it does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),

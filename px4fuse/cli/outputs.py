@@ -37,7 +37,7 @@ NO_STUDENT_NAME = ("", "")
 UNWRAPPED_WIDTH = 10_000
 # Key in the context of click for the list of files that this run has written
 WRITTEN_KEY = "px4fuse.written"
-# Key in the context of click: True if px4fuse opens the output in its default program
+# Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
@@ -82,7 +82,7 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # no progress bar, not even a disabled one: older versions of rich print an empty line after it
+    # even a disabled progress bar prints an empty line in older versions of rich
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return

@@ -1,4 +1,4 @@
-"""Command ``px4fuse practice``: writes a quiz page with simulated flights and hidden mistakes."""
+"""Command ``px4fuse practice``: writes a quiz page with simulated flights and injected faults."""
 
 import secrets
 import sys
@@ -28,8 +28,8 @@ from px4fuse.cli.outputs import (
     type=click.IntRange(1, 3),
     metavar="N",
     default=1,
-    help="Difficulty of the flights. 1: one large mistake; 2: one smaller mistake; 3: one or two "
-    "small mistakes.",
+    help="Difficulty of the flights. 1: one large fault; 2: one smaller fault; 3: one or two "
+    "small faults.",
 )
 @click.option(
     "--flights",
@@ -54,9 +54,9 @@ def practice(
     output: Path | None,
     opened: bool | None,
 ) -> None:
-    """Write a quiz page with simulated flights and hidden mistakes.
+    """Write a quiz page with simulated flights and injected faults.
 
-    For each flight: inspect the plots, test a setting, choose the mistake, and compare with the
+    For each flight: inspect the plots, test a setting, choose the fault, and compare with the
     solution. Not for exams: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed

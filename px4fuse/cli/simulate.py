@@ -1,4 +1,4 @@
-"""Command ``px4fuse simulate``: simulates flights with ground truth and chosen mistakes."""
+"""Command ``px4fuse simulate``: simulates flights with ground truth and injected faults."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def _scenario_options(command: Command) -> Command:
-    """Add an option for each number of a scenario; the field defines default and help."""
+    """Add an option for each number of a scenario, with default and help of the field."""
     for field, quantity in reversed(quantities(Scenario).items()):
         if not quantity.meaning:
             continue
@@ -72,10 +72,10 @@ def _scenario_options(command: Command) -> Command:
 
 
 class WithMistakes(click.Command):
-    """Command of click whose help ends with the table of mistakes."""
+    """Command of click whose help ends with the table of injected faults."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Mistakes for --mistake [default VALUE]"):
+        with formatter.section("Injected faults for --mistake [default VALUE]"):
             formatter.write_dl(
                 [
                     (
@@ -97,7 +97,7 @@ class WithMistakes(click.Command):
     "--assignment",
     "ROSTER.csv",
     "Class list (student id, name): writes one flight per student, with individual noises and "
-    "mistakes, and the answer key beside the folder.",
+    "injected faults, and the answer key beside the folder.",
 )
 @input_option(
     "--secret-file",
@@ -109,7 +109,7 @@ class WithMistakes(click.Command):
     "--mistakes",
     type=int,
     metavar="N",
-    help="Number of mistakes in each flight of --assignment.  [default: random, 0 to 2]",
+    help="Number of injected faults in each flight of --assignment.  [default: random, 0 to 2]",
 )
 @click.option(
     "--preview",
@@ -135,17 +135,17 @@ class WithMistakes(click.Command):
     "--mistake",
     metavar="NAME[=VALUE]",
     multiple=True,
-    help="Mistake to simulate, from the table below; repeatable.  [default: no mistake]",
+    help="Injected fault, from the table below; repeatable.  [default: none]",
 )
 @click.option(
     "--answer",
     type=NonEmptyPath(),
     metavar="FILE.json",
-    help="Answer key to write: mistakes, biases, outliers and clock offset of the flight; not for "
+    help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
     "students.  [default with --assignment: DIR_answers.json]",
 )
 @click.option("--no-truth", is_flag=True, help="Write no ground truth to the log.")
-@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2, which is faster.")
+@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2, to save time.")
 @click.option(
     "--passes",
     type=int,
@@ -176,10 +176,10 @@ def simulate(
     yaw: Yaw | None,
     **option_values: Any,
 ) -> None:
-    """Simulate a flight with known ground truth and chosen mistakes.
+    """Simulate a flight with ground truth and injected faults.
 
     Writes a PX4 ULog for exercises and exams, with ground truth unless --no-truth. The log states
-    that it is simulated, but not which mistakes it contains. The EKF2 data in the log are from
+    that it is simulated, but not its injected faults. The EKF2 data in the log are from
     px4fuse's model of EKF2, not from PX4's code.
 
     For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
@@ -221,7 +221,7 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Reject options that do not fit: some exclude --assignment, others require it."""
+    """Reject options that exclude --assignment, or that require it if it is missing."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR_KIND:
         raise SettingsError(
             f"--kind {OUTDOOR_KIND} is not available with --assignment.",
@@ -230,8 +230,8 @@ def _check_options(assignment: Path | None) -> None:
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{parameter.opts[0]} is not available with --assignment, which draws its value at "
-                "random for each student",
+                f"{parameter.opts[0]} is not available with --assignment, which draws flights "
+                "at random",
                 f"Omit {parameter.opts[0]}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
@@ -249,7 +249,7 @@ def _read_secret(file: Path | None) -> bytes | None:
         SettingsError,
         MAX_SECRET_BYTES,
         name=name,
-        size_remedy="Give a file with one line of text",
+        size_remedy="Give a file with one line of text.",
     )
     return encode_secret(text, name)
 
@@ -293,12 +293,12 @@ def _write_assignment(
             for student, flight in zip(students, previews, strict=True)
         ]
         page.table(
-            ("student", "name", "flight", "mistakes", "difficulty"),
+            ("student", "name", "flight", "injected faults", "difficulty"),
             rows,
             right_aligned_columns=(4,),
         )
         closing_texts["Preview"] = (
-            "no file was written. Not for students: the table lists the mistakes of each flight."
+            "no file was written. Not for students: the table lists the injected faults."
         )
     else:
         with progress() as show_progress:
@@ -313,12 +313,12 @@ def _write_assignment(
             f"{folder_text} ({written_files} logs written, {existing_count} existed already)"
         )
         closing_texts["Answers"] = (
-            f"{key_text} (not for students: it lists the mistakes of each flight)"
+            f"{key_text} (not for students: the file lists the injected faults)"
         )
         if key.secret:
             closing_texts["Secret"] = (
-                "generated, and stored in the answer key. With --secret-file, the same flights can "
-                "be written again and students can be added later."
+                "generated, and stored in the answer key. Use --secret-file to write the same "
+                "flights again, or to add students."
             )
     counts = Counter(
         mistake.partition("=")[0]
@@ -329,10 +329,10 @@ def _write_assignment(
     page.write_labelled_texts(
         {
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
-            "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+            "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
             "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: value of the most difficult "
-            "mistake that px4fuse detects in 19 of 20 flights, divided by the value in the flight",
+            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: smallest size of a fault that "
+            "px4fuse detects in 19 of 20 flights, divided by the size in the flight",
             **closing_texts,
         }
     )
@@ -354,16 +354,16 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
             f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
             "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
             f"{scenario.source_rate_hz:g} Hz"
-            + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
+            + (f", VIO drift {scenario.vio_drift:.1%} of the path" if loop else ""),
             "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
         }
     )
     mistake_texts = [
         f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
     ]
-    page.write_labelled("Mistakes", *(mistake_texts or ["none"]))
+    page.write_labelled("Faults", *(mistake_texts or ["none"]))
     page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    ekf2_text = "px4fuse's model of EKF2" if scenario.ekf2 else "not simulated and not in the log"
+    ekf2_text = "px4fuse's model of EKF2" if scenario.ekf2 else "not simulated (--no-ekf2)"
     page.write_labelled("EKF2", ekf2_text)
     if answer is not None:
         page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")

@@ -49,7 +49,7 @@ def verify(
     from px4fuse.verification.verification import verify as verify_report
 
     content = read_bytes_limited(
-        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report, which has less than 2 MB"
+        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report (PDF) of px4fuse."
     )
     recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
@@ -103,7 +103,7 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verdict.redrawn:
-        page.write("The report of -o was not written, because the analysis was not repeated.")
+        page.write("No report was written with -o, because the analysis was not repeated.")
     elif output is None and verdict.pages:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."

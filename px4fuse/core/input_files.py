@@ -21,7 +21,7 @@ _Identity = tuple[int, int] | str
 
 @dataclass(frozen=True)
 class _Register:
-    """Input files, folders that contain them, and folders whose parents are registered."""
+    """Input files and folders of a command that is running."""
 
     inputs: set[_Identity] = field(default_factory=set)
     input_by_folder: dict[_Identity, Path] = field(default_factory=dict)
@@ -52,7 +52,7 @@ def inputs_not_registered() -> Iterator[None]:
 
 
 def add_input(path: Path) -> None:
-    """Register an input file or folder; a path that does not exist is ignored."""
+    """Register an input file or folder that exists."""
     register = _register.get()
     if register is None or (identity := _identity(path)) is None:
         return
@@ -81,7 +81,7 @@ def check_output_folder(folder: Path) -> None:
     Files in the folder and in its subfolders are checked, because outputs are written to both.
     """
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"-o {folder} is not a folder. Choose another name.")
+        raise OutputError(f"the output folder {folder} is a file. Choose another name.")
     register = _register.get() or _Register()
     entries = _entries(folder)
     for path in (folder, *entries, *(child for entry in entries for child in _entries(entry))):
@@ -90,8 +90,8 @@ def check_output_folder(folder: Path) -> None:
         input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
         if input_path is not None:
             raise OutputError(
-                f"-o {folder} contains an input of this command, {input_path}",
-                "Choose another folder.",
+                f"the output folder {folder} contains {input_path}, an input of this command",
+                "Choose another output folder.",
             )
 
 

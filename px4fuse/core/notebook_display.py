@@ -10,16 +10,16 @@ MAX_TEXT_LENGTH = 60
 
 @singledispatch
 def display_html(result: object) -> str | None:
-    """Return a result as HTML for notebooks; None if notebooks show its text representation.
+    """Return a result as HTML for notebooks.
 
-    The function of a type is registered by the module that formats it, because the module of the
-    type must not import that module.
+    The module that formats a type registers a function for the type, because the module of the type
+    must not import it. Return None for other types, which notebooks show as text.
     """
     return None
 
 
 def one_line_repr(result: Any) -> str:
-    """Format a record on one line; a table or array is shown by its shape.
+    """Format a record on one line, with the shapes of tables and arrays instead of their values.
 
     >>> import pandas as pd
     >>> from px4fuse.flight.model import Truth

@@ -18,7 +18,7 @@ from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 
 #: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-_SIZE_REMEDY = "Cut the log to the flight, or increase the limit with --max-size MB"
+_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
 _BYTES_PER_MB = 1_000_000
 
 
@@ -60,15 +60,16 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     if stat.S_ISDIR(status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
-        raise error_type(
-            f"{name} is not a regular file (device, pipe or socket).", "Save its data to a file."
-        )
+        raise error_type(f"{name} is a device, pipe or socket.", "Save the data to a file first.")
     add_input(path)
     return status.st_size
 
 
 def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
-    """Read the first bytes of a regular file, at most ``count``; errors are of ``error_type``."""
+    """Read at most ``count`` first bytes of a regular file.
+
+    Errors are of type ``error_type``.
+    """
     file_size(path, error_type)
     return _read(path, count, error_type, display_name(path))
 
@@ -79,7 +80,7 @@ def read_bytes_limited(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Cut the file to the flight",
+    size_remedy: str = "Shorten the file to the flight.",
     empty_remedy: str | None = None,
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
@@ -106,9 +107,9 @@ def read_bytes_limited(
     if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
     if (actual_size := max(size, len(content))) > limit_bytes:
-        raise error_type(_too_large(name, actual_size, limit_bytes), f"{size_remedy}.")
+        raise error_type(_too_large(name, actual_size, limit_bytes), size_remedy)
     if empty_remedy is not None and not content:
-        raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
+        raise error_type(f"{name}: the file is empty", empty_remedy)
     return content
 
 
@@ -120,7 +121,7 @@ def read_log_bytes(path: Path) -> bytes:
     LogError
         The log cannot be read, is not a regular file, is empty or too large.
     """
-    limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again"
+    limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again."
     return read_bytes_limited(
         path, LogError, limit, size_remedy=_SIZE_REMEDY, empty_remedy=empty_remedy
     )
@@ -132,7 +133,7 @@ def read_text(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Shorten the file",
+    size_remedy: str = "Shorten the file.",
 ) -> str:
     """Read a text file in UTF-8, or in UTF-16 as written by Windows shells.
 
@@ -145,7 +146,8 @@ def read_text(
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
-            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save the file as UTF-8."
+            f"{name} is not a text file in UTF-8: byte {error.start} is invalid.",
+            "Save the file as UTF-8.",
         ) from error
 
 
@@ -168,7 +170,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
             ]
         elif (size := file_size(path, LogError)) > limit:
-            raise LogError(_too_large(display_name(path), size, limit), f"{_SIZE_REMEDY}.")
+            raise LogError(_too_large(display_name(path), size, limit), _SIZE_REMEDY)
         else:
             files = [path]
         for file in files:
@@ -182,9 +184,10 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
+    """Return all files in a folder and its subfolders, sorted.
 
-    A folder that cannot be listed is returned as a file, so that its reading raises the error.
+    Links to folders are not followed. A folder that cannot be listed is returned as a file, so that
+    its reading raises the error.
     """
     files: list[Path] = []
     open_folders = [folder]
@@ -212,9 +215,9 @@ def _unreadable(
     name: str, error: Exception, error_type: type[Px4FuseError], remedy: str = ""
 ) -> Px4FuseError:
     reason = getattr(error, "strerror", None) or error
-    return error_type(f"{name}: cannot be read ({reason}).", remedy)
+    return error_type(f"{name}: the file cannot be read ({reason}).", remedy)
 
 
 def _too_large(name: str, *sizes: int) -> str:
     size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
-    return f"{name}: the file has {size} MB; the limit is {limit} MB"
+    return f"{name}: the file has {size} MB, more than the limit of {limit} MB"

@@ -106,7 +106,7 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     try:
         return msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from error  # msgspec adds the path of the value
+        raise ValueError(str(error)) from error  # msgspec adds the path of the value to the message
 
 
 def to_serializable(value: Any) -> Any:

@@ -21,7 +21,7 @@ def neutralise_formulas(text: str) -> str:
 
 
 def neutralise_id(text: str) -> str:
-    """Return an id unchanged if it cannot be a formula, else :func:`neutralise_formulas` of it.
+    """Neutralise an id by :func:`neutralise_formulas` only if it can be a formula.
 
     >>> neutralise_id("0042"), neutralise_id("-17"), neutralise_id("a.b@c.de"), neutralise_id("=1")
     ('0042', '-17', 'a.b@c.de', "'=1")

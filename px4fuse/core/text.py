@@ -37,7 +37,9 @@ def to_json_types(value: object) -> Any:
 
 
 def utc_time(unix_s: float | None) -> str | None:
-    """Format a UNIX time (s) as ISO 8601 with milliseconds; None if unknown or out of range.
+    """Format a UNIX time (s) as ISO 8601 with milliseconds.
+
+    Return None if the time is unknown or out of range.
 
     >>> utc_time(1.5), utc_time(1e18)
     ('1970-01-01T00:00:01.500+00:00', None)
@@ -82,7 +84,7 @@ def capitalise_first(text: str) -> str:
 
 
 def lower_first(text: str) -> str:
-    """Return a sentence as the continuation of another one; acronyms such as UWB stay."""
+    """Begin a sentence in lower case, unless the first word is an acronym such as UWB."""
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
@@ -97,7 +99,7 @@ def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> s
 
 
 def format_p_value(p: float) -> str:
-    """Format a p-value with 2 digits; below 0.001, the text is "p < 0.001".
+    """Format a p-value with 2 digits, or as "p < 0.001".
 
     >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']

@@ -14,7 +14,9 @@ _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNOR
 
 
 def convert_to_unit(text: str, unit: str) -> float | None:
-    """Parse a number with or without a unit and convert it to ``unit``; None if impossible.
+    """Parse a number with or without a unit, and convert it to ``unit``.
+
+    Return None if the text is no number or has another kind of unit.
 
     >>> convert_to_unit("10cm", "m"), convert_to_unit("0,5", "s"), convert_to_unit("10 apples", "m")
     (0.1, 0.5, None)
@@ -25,5 +27,5 @@ def convert_to_unit(text: str, unit: str) -> float | None:
         return None
     try:
         return float(match[1].replace(",", ".")) * scale
-    except ValueError:  # several decimal points
+    except ValueError:  # the text contains several decimal points
         return None

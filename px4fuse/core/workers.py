@@ -39,7 +39,7 @@ _ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
 
 @dataclass(frozen=True)
 class JobFailure:
-    """Failure of a job in a worker process, used in place of its result; the reason is one line."""
+    """Failure of a job in a worker process, with the reason in one line; replaces its result."""
 
     reason: str
 
@@ -134,7 +134,7 @@ def run_bounded(
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.is_ready else START_TIMEOUT_S
                     workers.pop(pipe).end()
-                    yield worker.job, JobFailure(f"the time limit of {limit:g} s was exceeded.")
+                    yield worker.job, JobFailure(f"the job exceeded the time limit of {limit:g} s.")
     finally:
         for worker in workers.values():
             worker.end()
@@ -180,12 +180,12 @@ def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: 
 
 
 def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
-    """Run a job in a worker process; return the pickled message for :func:`_receive_result`."""
+    """Run a job in a worker process and pickle its result for :func:`_receive_result`."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
         # the next job would not have enough memory, so the process ends
-        failure = JobFailure("the memory limit for one file was exceeded.")
+        failure = JobFailure("the job exceeded the memory limit for one file.")
         return pickle.dumps((False, failure))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
         kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "

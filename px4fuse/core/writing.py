@@ -67,10 +67,10 @@ def written_before(paths: Sequence[Path]) -> str:
     """Format the list of the outputs that a run wrote before it ended early.
 
     >>> written_before([Path("a.pdf"), Path("a.json")])
-    'already written: a.pdf, a.json'
+    'outputs already written: a.pdf, a.json'
     """
-    is_listed = len(paths) <= _MAX_LISTED
-    return f"already written: {', '.join(map(str, paths)) if is_listed else f'{len(paths)} files'}"
+    names = ", ".join(map(str, paths)) if len(paths) <= _MAX_LISTED else f"{len(paths)} files"
+    return f"outputs already written: {names}"
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -94,7 +94,7 @@ def _is_standard_output(path: Path) -> bool:
 
 
 def _file_mode(path: Path) -> int:
-    """Return type and permissions of a file; for a new file, the type of a regular file."""
+    """Return type and permissions of a file, or the type of a regular file if it does not exist."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
@@ -114,7 +114,7 @@ def _replace(target: Path, content: bytes) -> None:
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe; wait at most READER_TIMEOUT_S for a program that reads it."""
+    """Open a named pipe after a wait of at most READER_TIMEOUT_S for a program that reads it."""
     deadline = time.monotonic() + READER_TIMEOUT_S
     while True:
         try:
@@ -130,9 +130,9 @@ def _open_pipe(path: Path) -> IO[bytes]:
 
 def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
-    reason = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
+    reason = "no program reads the pipe" if error.errno == errno.ENXIO else error.strerror
     already_written = f"; {written_before(written_files)}" if written_files else ""
-    remedy = "Choose another name."
+    remedy = "Choose another output name."
     if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
-        remedy = "Close the program that has the file open, or choose another name."
-    return OutputError(f"{name}: cannot be written ({reason}){already_written}", remedy)
+        remedy = "Close the program that has the file open, or choose another output name."
+    return OutputError(f"{name} cannot be written ({reason}){already_written}", remedy)

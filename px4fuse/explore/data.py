@@ -46,7 +46,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
     Parameters
     ----------
     analysis : Analysis
-        Must have a request.
+        Analysis of one flight, with the request.
     packer : Packer
         Collects the arrays.
     """
@@ -89,7 +89,7 @@ def replay_signals(comparison: Comparison, packer: Packer) -> Data:
 
 
 def ranges() -> Data:
-    """Return limits and lesson values of the KF settings, and the axis of the σ ratios."""
+    """Return limits and lesson values of the KF settings, and the scale of the σ ratio plots."""
     return {
         "sigma-a": list(SIGMA_A_RANGE_M_S2),
         "sigma-z": list(SIGMA_Z_RANGE_M),
@@ -117,9 +117,9 @@ def _settings_data(settings: Settings) -> Data:
 
 
 def _offset_data(request: ComparisonRequest, analysis: Analysis) -> Data:
-    """Return range and estimate of the time offset, or the reason why it cannot change."""
+    """Return range and estimate of the time offset, or the reason why the slider is disabled."""
     if request.position is not None:
-        return {"why": "the time offset of a position file is used to align the file with the log"}
+        return {"why": "the time offset aligns the position file with the log"}
     centre, clock = analysis.settings.clock_offset_s, analysis.clock
     estimate_s = None
     if isinstance(clock, ClockOffset) and clock.is_determinable:
@@ -307,7 +307,7 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
     }
     if isinstance(analysis.ekf2_model, Unavailable):
         return {"flown": flown_settings, "why": analysis.ekf2_model.reason}
-    # half of the logged noise is an example that changes S and the error visibly
+    # half of the logged noise: an example whose effect on S and on the error is visible
     parameter = PARAMETERS[aid.noise]
     flown_m = logged_parameters.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}

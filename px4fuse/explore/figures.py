@@ -23,7 +23,7 @@ from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 
 # Options of a drawing function of Bokeh
 Style = dict[str, Any]
-# Columns of the data sources, which the script of the page fills as far as a plot needs them
+# Columns of all Bokeh data sources; the script of the page fills those that a plot needs
 COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right text"
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
 # the report
@@ -67,7 +67,7 @@ class Plot(Record, frozen=True):
     Attributes
     ----------
     lines : tuple of (source, column, style, name)
-        Key of :data:`STYLES`, and name in the tooltip ("": no tooltip).
+        ``style`` is a key of :data:`STYLES`, ``name`` the label in the tooltip ("": no tooltip).
     """
 
     lines: tuple[tuple[str, str, str, str], ...]
@@ -76,7 +76,7 @@ class Plot(Record, frozen=True):
 
 
 class View(Record, frozen=True):
-    """View of the page, with the titles of its plots."""
+    """View of the page, with the titles of its plots by their names."""
 
     title: str
     plots: Mapping[str, str]
@@ -209,7 +209,7 @@ def _figure(name: str, height: int, **options: Any) -> Any:
 
 
 def _add_cursor(fig: Any, **options: Any) -> None:
-    """Add the vertical line at the time of the selected measurement, or at its position."""
+    """Add a vertical line at the time or position of the selected measurement."""
     fig.add_layout(Span(dimension="height", location=0.0, visible=False, **options))
 
 

@@ -87,21 +87,21 @@ const Explore = (async () => {
   }
   const axisNow = () => axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
-  const mapNow = () => flight.maps[axisNow().map] ?? "it was not computed for this axis";
+  const mapNow = () => flight.maps[axisNow().map] ?? "not computed for this axis";
 
   onClick("lesson", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
     set({ sigmaA, sigmaZ, dt });
-    showMessage("SIGMA_A, SIGMA_Z and DT have the values of the lesson UAT 366, module 2.");
+    showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
     const [sigmaA, sigmaZ] = mapNow().likely;
     set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
-    showMessage("SIGMA_A and SIGMA_Z are the maximum-likelihood estimates from the innovations of this flight.");
+    showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
   onClick("ekf2-r", () => {
     set({ sigmaZ: round(axisNow().ekf2.r, 3) });
-    showMessage("SIGMA_Z is the median of √R of EKF2.");
+    showMessage("SIGMA_Z is set to the median of √R of EKF2.");
   });
 
   /* Change settings, re-run KF and draw; during a drag at most once per frame, with fewer points */
@@ -415,7 +415,7 @@ const Explore = (async () => {
     if (isText(map)) return `The likelihood map is missing: ${map}.`;
     const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
     const differs = ["dt", "offset", "input"].some((key) => initial[key] !== settings[key]);
-    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset ${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. Dot: current settings. One shade: 0.5 σ.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
+    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset ${round(initial.offset, 4)} s. Darker colours: higher likelihood, in steps of 0.5 σ. Cross: maximum. Dot: current settings.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
   }
 
   // ------------------------------------------------------------------ command

@@ -24,12 +24,12 @@ def html_text(analysis: Analysis) -> str:
     Parameters
     ----------
     analysis : Analysis
-        Must have a request.
+        Analysis of one flight, with the request.
 
     Returns
     -------
     str
-        Write it as UTF-8.
+        HTML page, to be written as UTF-8.
     """
     packer = Packer()
     data, card = flight_data(analysis, packer), card_of(analysis)

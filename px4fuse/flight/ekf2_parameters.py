@@ -103,14 +103,14 @@ class Parameter(NamedTuple):
         """Unit with superscripts: "m/s²" for "m/s^2"."""
         return self.unit.replace("^2", "²").replace("^3", "³")
 
-    def describe_range_error(self, value: float) -> str:
-        """Return " 9 m is outside PX4's range 0.01 to 5" for a value outside the range, else ""."""
+    def describe_range_error(self, name: str, value: float) -> str:
+        """Return "EKF2_EVP_NOISE 9 m is outside PX4's range 0.01 to 5", or "" inside the range."""
         low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
         high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
         if low <= value <= high:
             return ""
         unit = f" {self.unit}" if self.unit else ""
-        return f" {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
+        return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
 TABLES = table(__file__, "ekf2_parameters.toml", dict)
@@ -200,16 +200,16 @@ def replace_invalid_parameters(
         defaults |= OLD_DEFAULTS
     for name, value in logged_values.items():
         parameter = PARAMETER_RANGES.get(name)
-        fault = "" if parameter is None else parameter.describe_range_error(value)
+        fault = "" if parameter is None else parameter.describe_range_error(name, value)
         if not math.isfinite(value):
-            fault = " is not a finite number"
+            fault = f"{name} is not a finite number"
         if not fault:
             valid[name] = value
         elif parameter is None:
-            notes.append(f"{name}{fault} and is not used.")
+            notes.append(f"{fault} and is not used.")
         else:
             valid[name] = defaults[name]
-            notes.append(f"{name}{fault}; the default {valid[name]:g} is used.")
+            notes.append(f"{fault}; the default {valid[name]:g} is used.")
     return valid, tuple(notes)
 
 
@@ -233,8 +233,8 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
                 f"{name} is not a parameter of the EKF2 replay",
                 f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
             )
-        if fault := parameter.describe_range_error(value):
-            raise SettingsError(f"{name}{fault} (default {parameter.default:g}).")
+        if fault := parameter.describe_range_error(name, value):
+            raise SettingsError(f"{fault} (default {parameter.default:g}).")
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
-            raise SettingsError(f"{name}={value:g} is not possible. Give 0 or 1.")
+            raise SettingsError(f"{name} {value:g} is neither 0 nor 1.")
     return {name: float(value) for name, value in changes.items()}

@@ -8,8 +8,8 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, NotNegative, Record, Sha256, Share
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 
-SHARED_STAMPS = "most samples share a timestamp"
-# Clock of timestamps that PX4 converted or replaced
+SHARED_STAMPS = "most timestamps are repeated"
+# Name of the clock of timestamps that PX4 converted from the sender's clock, or replaced
 SENDER_CLOCK = "sender timestamps"
 
 
@@ -85,7 +85,7 @@ class ClockMap(Record, frozen=True):
 
 @dataclass(frozen=True)
 class Stream:
-    """PX4 topics or MAVLink messages of one kind of data, clock of the timestamps, and log name."""
+    """Origin of one kind of data: topics or messages, clock of the timestamps, and file name."""
 
     topics: tuple[str, ...]
     clock: str
@@ -94,7 +94,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class UnusedData:
-    """Topic or message about position that px4fuse does not use; ``count``: its messages."""
+    """Topic or message with position data that px4fuse does not use, and its number of messages."""
 
     name: str
     count: int
@@ -138,7 +138,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     parameters : mapping
         PX4 parameters for fusion and logging at the start of the log, by name.
     parameter_defaults : mapping
-        Logged firmware defaults of the EKF2 parameters that differ from their default; ULog only.
+        Logged firmware defaults of the EKF2 parameters whose values are changed; ULog only.
     notes : tuple of str
         Sentences about dropped samples and clocks.
     damage : tuple of str
@@ -195,5 +195,5 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
 
     @property
     def has_ulog(self) -> bool:
-        """True if the autopilot writes ULog files; ArduPilot writes DataFlash instead."""
+        """True if the autopilot writes ULog files, as PX4 does."""
         return self.autopilot != "ArduPilot"

@@ -51,7 +51,7 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
 }
 
 
-# Of objects, because pandas reserves 1 GB of address space for its first column of strings
+# The dtype is object, because pandas reserves 1 GB of address space for a first column of strings
 NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dtype=np.float64))
 
 
@@ -67,7 +67,7 @@ class Columns:
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
-    # State and variances of EKF2 at the fusion horizon, common to all PX4 releases
+    # Columns of EKF2's state and variances at the fusion horizon, the same for all PX4 releases
     GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
     ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
     EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
@@ -251,12 +251,12 @@ class PositionTrack:
 
     @property
     def rate_hz(self) -> float:
-        """Sample rate (Hz) without gaps; NaN for fewer than two samples."""
+        """Sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
 
 def source_name(source: PositionTrack) -> str:
-    """Return the usual name of a position source, such as "UWB", instead of its topic."""
+    """Return the name of a position source for users, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
 
 
@@ -269,7 +269,7 @@ def reset_times_s(track: PositionTrack) -> Array:
 def positions_of(source: PositionTrack) -> str:
     """Return the noun phrase for the positions of a source: "UWB positions"."""
     if source.origin.kind == "file":
-        return "positions of the file"
+        return "positions in the position file"
     return f"{source_name(source)} positions"
 
 
@@ -292,7 +292,7 @@ class Reset:
     delta: tuple[float, float, float]
 
 
-EKF2_STEP_S = 0.010  # s; default of EKF2_PREDICT_US (ekf2_params.c)
+EKF2_STEP_S = 0.010  # default of EKF2_PREDICT_US in s (ekf2_params.c)
 BIAS_NOT_LOGGED = Unavailable(
     "EKF2 accelerometer bias",
     "estimator_sensor_bias and estimator_states are not logged",
@@ -300,7 +300,7 @@ BIAS_NOT_LOGGED = Unavailable(
 )
 HORIZON_NOT_LOGGED = Unavailable(
     "EKF2 fusion horizon",
-    "the log has no separate times of fusion and publication",
+    "the log has publication times but no fusion times",
     "Record a ULog with PX4 v1.13 or newer.",
 )
 
@@ -332,9 +332,9 @@ class FusionRecord:
         (NED) and the body (FRD) are in gauss. Then the variances of attitude error about north,
         east and down, of velocity, position, the biases and both fields.
     per_step_biases : bool
-        True if this release stores biases as increments per prediction (up to v1.14).
+        True if the PX4 release stores biases as increments per prediction (up to v1.14).
     other_aiding : tuple of str
-        Horizontal aids besides vision position that EKF2 used at any time.
+        Horizontal aiding sources other than external vision position that EKF2 used at any time.
     vision_age_s : Series
         Delay (s) from measurement to publication of each external vision sample, indexed by
         measurement time; empty if not logged.
@@ -375,11 +375,14 @@ class FusionRecord:
 
     @property
     def stores_latitude(self) -> bool:
-        """True if EKF2 stores its position as latitude and longitude (since v1.16)."""
+        """True if EKF2 stores the position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times in the state, a key of ``states``; all False if not logged."""
+        """Return a mask of the times at which EKF2 was in a state, which is a key of ``states``.
+
+        The mask is False if the state is not logged.
+        """
         steps = self.states.get(state)
         return (
             np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
@@ -403,9 +406,9 @@ class AidLog:
         ``filtered_down`` (prediction minus measurement, low-pass filtered). In the unit of the aid
         or its square.
     enabled : Series or None
-        Step function: 1 while fusion of the aid is enabled, otherwise 0; None if not logged.
+        Step function: 1 while fusion of the source is enabled, otherwise 0; None if not logged.
     parameters : mapping
-        EKF2 parameters of the aid at the start of the log, by PX4 name.
+        EKF2 parameters of the aiding source at the start of the log, by PX4 name.
     excluded_count : int
         Number of innovations that were dropped because no variance is near in time.
     unjudged_s : ndarray
@@ -424,7 +427,10 @@ class AidLog:
 
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Return the values of a step function at times; before its first time, its first value."""
+    """Return the values of a step function at times.
+
+    Before the first time of the step function, its first value is returned.
+    """
     rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[rows]
 
@@ -473,9 +479,9 @@ class Ekf2:
     record : FusionRecord or Unavailable
         Data at the fusion horizon.
     aids : mapping from PX4 name to AidLog
-        Logged data of all aids that EKF2 can fuse.
+        Logged data of all aiding sources that EKF2 can fuse.
     states : mapping from name to Series
-        Step functions, only those that are logged: 1 while an aid is enabled, by its PX4 name;
+        Logged step functions: 1 while an aiding source is enabled, by its PX4 name;
         ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
         ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
     parameters : mapping
@@ -533,7 +539,7 @@ MODES_NOT_LOGGED = Unavailable(
 )
 
 
-# eq=False: hash and equality by identity, because caches use flights as keys
+# Flights are compared by identity (eq=False), because caches use flights as keys
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.
@@ -554,8 +560,8 @@ class Flight:
         Intervals (s) in which the land detector reports flight; empty if none.
     missing : tuple of Unavailable
         Missing data, with reason and action.
-    streams : mapping from part to Stream
-        Source of each available kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
+    streams : mapping from kind of data to Stream
+        Source of the data: "imu", "attitude", "ekf2_state", "ekf2_variance",
         "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
     clocks : tuple of ClockMap
         Maps from other clocks to the boot clock.
@@ -613,11 +619,12 @@ def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
 
 
 def sample_rate(samples: pd.DataFrame) -> float:
-    """Return the sample rate (Hz) of a time-indexed frame without gaps; NaN below two samples.
+    """Return the sample rate (Hz) outside of gaps of a table that is indexed by time.
 
     The rate is the inverse mean of all intervals up to three times the median. The median alone
     would be wrong for a decimated topic, which alternates between two intervals. For samples in
-    bursts, without a regular interval, the mean of all intervals is used.
+    bursts, without a regular interval, the mean of all intervals is used. The result is NaN for
+    fewer than two samples.
     """
     if len(samples) < 2:
         return float("nan")

@@ -70,7 +70,7 @@ class Origin(Record, frozen=True):
 
     @property
     def preference(self) -> int:
-        """Index in :data:`ORIGINS`; the position source with the smallest index is preferred."""
+        """Index of this origin in :data:`ORIGINS`; a smaller index is preferred."""
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
@@ -91,5 +91,5 @@ def find_origin(kind: str, path: str) -> Origin:
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the source reports a changing orientation (``turns``)."""
+    """Change the kind "uwb" to "vio" if the source sends a changing orientation (``turns``)."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

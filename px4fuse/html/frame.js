@@ -55,7 +55,7 @@
     for (const [item, max, points, comment] of rows) {
       const number = make("input", "", { type: "number", min: 0, max, step: "any", value: points ?? "" });
       const text = make("textarea", comment, { rows: 2, dir: "auto" });
-      for (const [title, field] of [[`Points of ${max} for ${item}`, number], ["Comment", text]]) {
+      for (const [title, field] of [[`Points for ${item} (maximum ${max})`, number], ["Comment", text]]) {
         node.append(fill(makeIsolated("label", title), [field]));
         field.addEventListener("input", () => {
           setRow(typedRows, owner, item, number.value, text.value);

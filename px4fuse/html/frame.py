@@ -180,7 +180,7 @@ def page(
         Sentence for readers without scripts: the file with all rows.
     ratio_axis : mapping, optional
         Scale of the plots in columns of ratios: ``ends``, ``bands`` and ``marks`` (SVG paths).
-        Keys are the second word of the style class of a cell.
+        The second word of the style class of a cell is a key of ``bands`` and ``marks``.
 
     Returns
     -------
@@ -227,7 +227,7 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a cell without empty ends; the value True is equal to the text."""
+    """Return the fields of a cell up to the last non-empty one; True stands for value = text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     fields = [cell.text, value, cell.below, cell.style_class]
     while fields and fields[-1] == "":

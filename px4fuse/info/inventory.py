@@ -58,13 +58,13 @@ SAMPLES_BY_ANALYSIS = {
     "EKF2 consistency": "EKF2 innovations",
     "error": "samples of ground truth",
 }
-NO_COMPARISON = Unavailable("comparison", "the log contains no position to compare with", "")
+NO_COMPARISON = Unavailable("comparison", "the log contains no position source for KF", "")
 TimeSpans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse; ``reason``: data used, or why the analysis is not possible."""
+    """Analysis of px4fuse, with the data that it uses or the reason why it is not possible."""
 
     name: str
     possible: bool
@@ -185,7 +185,7 @@ def take_inventory(flight: Flight) -> Inventory:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
         remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
-            remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
+            remedy = "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
     if comparison is not None:
         flight = select_innovations(flight, comparison.source)
     log = flight.log
@@ -213,7 +213,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
-    """Convert the inventory of a log to JSON types; unknown values are absent."""
+    """Convert the inventory of a log to JSON types, without unknown values."""
     inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
@@ -311,13 +311,16 @@ def _analysis_options(
         yield AnalysisOption("compare", False, reason)
     else:
         source, segment = comparison.source, comparison.segment
-        count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
-        description = "KF with position source {}, {} samples, {:.1f} s to {:.1f} s"
-        yield AnalysisOption("compare", True, description.format(source.name, count, *span))
+        count = len(cut_to_segment(source.samples, segment))
+        description = (
+            f"KF with {count} samples of position source {source.name} from "
+            f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
+        )
+        yield AnalysisOption("compare", True, description)
     imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
         imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
-    acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
+    acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
     yield from _comparison_options(flight, comparison)
     aids, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
@@ -328,7 +331,7 @@ def _analysis_options(
     inputs, description = prepare_inputs(flight), ""
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
-        description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
+        description = f"EKF2 replay of {replayed_s:.0f} s with {inputs.aid.label}"
     yield _analysis_option("what-if", inputs, description)
 
 
@@ -368,7 +371,7 @@ def _comparison_options(flight: Flight, comparison: Comparison | None) -> Iterat
 def _logging_advice(
     flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the different actions of findings about the recording, and of missing data."""
+    """Collect the actions of findings on the recording and of missing data, each action once."""
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:

@@ -20,11 +20,11 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Components of a vector or quaternion, by the word that represents them in columns.csv
+# Axes or elements of a vector or quaternion, by the placeholder in columns.csv
 COMPONENTS = {
-    "AXIS": ("north", "east", "down"),
-    "BODY": ("forward", "right", "down"),
-    "WXYZ": ("w", "x", "y", "z"),
+    "{axis}": ("north", "east", "down"),
+    "{body_axis}": ("forward", "right", "down"),
+    "{element}": ("w", "x", "y", "z"),
 }
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
 # Characters of track names that are not used in file names, as some systems do not allow them
@@ -33,14 +33,14 @@ _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
-    "the log contains no position track. px4fuse info LOG lists settings to log one",
+    "the log contains no position track. px4fuse info LOG lists the settings to log positions",
     "",
 )
 
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Exported table; ``columns`` has one row of the data dictionary per column of ``data``."""
+    """Exported table ``data``, and ``columns``: the data dictionary with a row for each column."""
 
     name: str
     data: pd.DataFrame
@@ -245,7 +245,7 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name; ignoring case, all names are different."""
+    """Yield each position track with a table name that is unique, also without regard to case."""
     used_names: set[str] = set()
     for track in flight.positions:
         # with the prefix, no name is one that Windows reserves (con, aux, ...)

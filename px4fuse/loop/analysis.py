@@ -164,7 +164,11 @@ def _find_true_end(
             )
         return loop_segment.convert_measured_end(path, request.landed_at)
     if not request.closed_loop:
-        return Unavailable("loop closure error", "--open declares the loop open", "Omit --open.")
+        return Unavailable(
+            "loop closure error",
+            "--open states that the path does not return to its start",
+            "Omit --open.",
+        )
     if isinstance(truth_end, TrueEnd):
         return truth_end
     flight = segment.flight
@@ -174,9 +178,9 @@ def _find_true_end(
     ):
         return Unavailable(
             "loop closure error",
-            f"{path.name} has poses only from {segment.start_s:.1f} s to {segment.end_s:.1f} s, a "
-            "part of the flight",
-            "Choose a part that is a loop with --from and --to.",
+            f"{path.name} has poses only from {segment.start_s:.1f} s to {segment.end_s:.1f} s, "
+            "not of the whole flight",
+            "Choose the time span of a loop with --from and --to.",
         )
     return loop_segment.assume_end_at_takeoff(path)
 
@@ -189,7 +193,10 @@ def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Choose key frames; return their indices, and the distance along them at each pose (m)."""
+    """Choose key frames of a path.
+
+    Return the indices of the key frames, and the distance (m) along the key frames at each pose.
+    """
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[frame_indices])
@@ -197,7 +204,7 @@ def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Ar
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{spacing_m:g} m",
-            "Change --from, --to or --key-frames.",
+            "Change the time span (--from, --to) or the distance of key frames (--key-frames).",
         )
     return frame_indices, np.interp(path.time_s, path.time_s[frame_indices], distance_m)
 
@@ -211,7 +218,7 @@ def _require_in_range(name: str, value: float, min_value: float) -> None:
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
     (start_s, end_s), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
-    label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
+    label = f"{path.name}: loop closure {times[0]:.12g},{times[1]:.12g}"
     if not start_s <= times[0] < times[1] <= end_s:
         raise TrajectoryError(
             f"{label}: the times must be in ascending order, between {start_s:.2f} s and "
@@ -242,7 +249,10 @@ def _compute_heading_error(
 
 
 def truth_of(flight: Flight) -> Trajectory | None:
-    """Return the ground truth of a flight; None if it is missing."""
+    """Return the ground truth of a flight as a trajectory.
+
+    Return None if the log contains no ground truth.
+    """
     try:
         return trajectory_of(flight, "truth")
     except MissingDataError:
@@ -254,7 +264,7 @@ def analyse_flight_loop(
 ) -> Loop | Unavailable:
     """Analyse the loop of a flight's odometry, for ``px4fuse compare``.
 
-    Unavailable without odometry, or if the odometry does not end near its start.
+    The result is Unavailable without odometry, or if the odometry does not end near its start.
     """
     odometry = find_odometry(flight)
     try:
@@ -262,7 +272,9 @@ def analyse_flight_loop(
     except MissingDataError as error:  # the odometry has too few poses, or is missing
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
-            "loop closure", reason, "Send visual-inertial odometry to PX4 as ODOMETRY."
+            "loop closure",
+            reason,
+            "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
@@ -279,6 +291,7 @@ def analyse_flight_loop(
             "loop closure",
             f"the odometry has an extent of {extent_m:.1f} m and ends {gap_m:.1f} m from its "
             "start, so it is not a loop",
-            "Fly back to the take-off place, or use px4fuse loop with --closure.",
+            "Fly back to the take-off place, or give two times at one place with px4fuse loop "
+            "--closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

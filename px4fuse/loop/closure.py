@@ -32,7 +32,7 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
         [0, 1, 2],
         [1.0, -1.0, -1.0],
         "FRD",
-        "the frame is unknown, so z is assumed to be up",
+        "the coordinate frame is unknown, so z is assumed to be up",
     ),
 }
 # Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
@@ -69,7 +69,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate a trajectory to another frame; convert camera axes to body axes, or back."""
+    """Rotate a trajectory to another frame, and convert camera axes to body axes or the reverse."""
     rotation = Rotation.from_matrix(matrix)
     rotated = replace(
         trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame
@@ -99,7 +99,8 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
             frame_indices.append(index)
             last_frame_m = position
     if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
-        frame_indices.pop()  # too near to the last pose: the distance would be mostly noise
+        # too near to the last pose, so the distance between them would be mostly noise
+        frame_indices.pop()
     return np.array([*frame_indices, len(position_m) - 1])
 
 

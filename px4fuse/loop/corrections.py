@@ -22,8 +22,8 @@ from px4fuse.trajectory.graph.solver import Solution, solve
 from px4fuse.trajectory.model import Trajectory
 
 UNCORRECTED = "uncorrected"
-POSITIONS_ONLY = "by distance, positions only"
-BY_DISTANCE = "by distance, headings too"
+POSITIONS_ONLY = "positions corrected by distance"
+BY_DISTANCE = "positions and headings corrected by distance"
 # Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
@@ -32,10 +32,11 @@ CORRECTION_LABELS: Mapping[str, str] = {
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
 SINGLE_LOOP_REASON = (
-    "A single loop has no redundancy: only the gate can reject it, robust optimisation cannot."
+    "A single loop closure has no redundancy: only the gate can reject the loop closure, robust "
+    "optimisation cannot."
 )
-# Corrected path and the pose graph solution (None without a pose graph), or the reason why the
-# corrected path is missing
+# Corrected path with the solution of its pose graph (None without a pose graph), or the reason why
+# the corrected path is missing
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -46,7 +47,7 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing: Closure | None,
 ) -> dict[CorrectionName, Corrected]:
-    """Correct the path by distance: positions only (UAT 366, Example 2), and also headings."""
+    """Distribute the closure error over positions (UAT 366, Example 2), and over headings, too."""
     if landing is not None and not landing.accepted:
         misclosure_m = _unavailable_by_gate("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
@@ -65,15 +66,20 @@ def correct_paths_by_distance(
 def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
-        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g})",
-        "Measure the landing place (--landed-at), give --open, or increase --drift.",
+        f"the gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
+        f"p {closure.p:.1g})",
+        "Measure the landing place (--landed-at), increase the odometry drift (--drift), or give "
+        "--open if the path does not return to its start.",
     )
 
 
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test the closures (last edges of the graph) against odometry; return () without a graph."""
+    """Test the loop closures, which are the last edges of the graph, against odometry.
+
+    Return an empty tuple without a graph.
+    """
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
@@ -103,7 +109,11 @@ def solve_pose_graphs(
     """
     corrections: dict[Any, Corrected] = {}
     if not closures and not isinstance(graph, Unavailable):
-        graph = Unavailable("pose graph", "the path has no loop closure", "Give --closure.")
+        graph = Unavailable(
+            "pose graph",
+            "the path has no loop closure",
+            "Give two times at one place with --closure.",
+        )
     if isinstance(graph, Unavailable):
         corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
         return corrections, ()
@@ -118,7 +128,7 @@ def solve_pose_graphs(
         progress(f"optimising: {label}")
         if robust and len(closures) < 2:
             corrections[name] = Unavailable(
-                label, SINGLE_LOOP_REASON, "Give further closures with --closure."
+                label, SINGLE_LOOP_REASON, "Give more loop closures with --closure."
             )
         elif is_gated and is_rejected[is_closure].all():
             corrections[name] = _unavailable_by_gate("pose graph", closures[0])
@@ -179,7 +189,9 @@ def score_paths(
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
             return Unavailable(
-                f"score against {reference.name}", str(error), "Give another --reference."
+                f"score against {reference.name}",
+                str(error),
+                "Give another reference trajectory with --reference.",
             )
 
     def score_path(

@@ -16,7 +16,7 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, 
 
 # Time (s) over which poses on the ground are averaged
 REST_TIME_S = 1.0
-# Maximum range (m) of the positions of a vehicle at rest
+# Maximum extent (m) of the positions of a vehicle at rest
 MAX_REST_RANGE_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
 MAX_SAME_HEADING_DEG = 15.0
@@ -25,7 +25,9 @@ MAX_SAME_HEADING_DEG = 15.0
 def cut_trajectory(
     trajectory: Trajectory, segment: Segment, rests_at_ends: bool = False
 ) -> Trajectory:
-    """Cut a trajectory to a segment; average the poses at rest on the ground if ``rests_at_ends``.
+    """Cut a trajectory to a segment.
+
+    If ``rests_at_ends``, the first and last pose are averages over the rest on the ground.
 
     Raises
     ------
@@ -37,7 +39,8 @@ def cut_trajectory(
     if is_inside.sum() < MIN_POSES:
         raise TrajectoryError(
             f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {is_inside.sum()} poses "
-            f"between {segment.start_s:.2f} s and {segment.end_s:.2f} s; {MIN_POSES} are needed"
+            f"between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
+            f"{MIN_POSES} are needed"
         )
     segment_track = trajectory[is_inside]
     if not rests_at_ends:
@@ -46,7 +49,7 @@ def cut_trajectory(
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
         resting = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
-        # Without rest, the single pose at this end of the segment is used
+        # If the vehicle is not at rest, the single pose at this end of the segment is used
         if (
             not len(resting)
             or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > MAX_REST_RANGE_M
@@ -93,21 +96,24 @@ def choose_loop_segment(
     if start_s is not None or end_s is not None:
         low_s = low_s if start_s is None else start_s
         high_s = high_s if end_s is None else end_s
-        reason = "chosen with --from or --to"
+        reason = "the time span was chosen with --from or --to"
     if not low_s < high_s:
         raise SettingsError(
-            f"The track has no poses between {low_s:.12g} s and {high_s:.12g} s; it is from "
-            f"{span_s[0]:.2f} s to {span_s[1]:.2f} s.",
+            f"The track has no poses between {low_s:.12g} s and {high_s:.12g} s; it is "
+            f"from {span_s[0]:.2f} s to {span_s[1]:.2f} s.",
             "Change --from or --to.",
         )
     inside_s = max(low_s, span_s[0]), min(high_s, span_s[1])
     if inside_s != (low_s, high_s) and inside_s[0] < inside_s[1]:
-        reason, (low_s, high_s) = f"{reason}, cut at the ends of the data", inside_s
+        reason, (low_s, high_s) = f"{reason}, limited to the time of the data", inside_s
     return Segment(low_s, high_s, reason, flight_s), rests_at_ends
 
 
 def heading_change_deg(path: Trajectory) -> float | None:
-    """Return final minus initial heading (°), clockwise; None without orientations."""
+    """Return final minus initial heading (°), clockwise.
+
+    Return None if the path has no orientations.
+    """
     if path.rotation is None:
         return None
     return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
@@ -121,13 +127,15 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     """
     change_deg = heading_change_deg(path)
     is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG
-    heading_text = " with the same heading" if is_same_heading else "; the final heading is unknown"
+    source = "assumed: landing at the take-off place, final heading unknown"
+    if is_same_heading:
+        source = "assumed: landing at the take-off place with the initial heading"
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
-        source=f"assumed: the landing place is the take-off place{heading_text}",
+        source=source,
         assumed=True,
     )
 

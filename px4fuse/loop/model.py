@@ -118,8 +118,8 @@ class Closure(Record, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         if self.source == LANDING_SOURCE:
-            return "the closure of take-off and landing"
-        return f"the closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
+            return "the loop closure of take-off and landing"
+        return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
 class Correction(Record, frozen=True, kw_only=True):
@@ -221,7 +221,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Available paths by name; the odometry is first."""
+        """Available paths by name, with the odometry first."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
         }

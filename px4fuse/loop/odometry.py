@@ -14,8 +14,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of the reported position variance at the end of the path to that at its start: with
-# less growth, the default drift is used
+# Minimum ratio of the reported position variance at the end of the path to that at its start, for
+# using the reported variances: with less growth, the default drift is used
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge as fraction of the default drift: a reported growth may be
 # zero
@@ -57,13 +57,16 @@ def odometry_variances(
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
     drift_origin = "default" if noise == OdometryNoise() else "from options"
-    drift_text = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
-    origin_texts = [f"the odometry drift is {drift_text} (1 σ, {drift_origin})"]
+    origin_texts = [
+        f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
+        f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin})"
+    ]
     position_growth = _variance_growth(path.position_variance_m2, nodes)
     if position_growth is not None:
         translation = np.maximum(position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation)
         origin_texts.append(
-            "the translation variances are the growth of the logged position variances"
+            "the translation variances of the odometry are the growth of the logged position "
+            "variances"
         )
     elif path.position_variance_m2 is not None:
         origin_texts.append("the logged position variances do not grow, so they are not used")
@@ -71,13 +74,17 @@ def odometry_variances(
     if rotation_growth is not None:
         rotation = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation)
         origin_texts.append(
-            "the rotation variances are the growth of the logged orientation variances"
+            "the rotation variances of the odometry are the growth of the logged orientation "
+            "variances"
         )
     return translation, rotation, "; ".join(origin_texts)
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Compute the growth of reported variances between nodes, (k - 1, 3); None if too small."""
+    """Compute the growth of reported variances between graph nodes, shape (k - 1, 3).
+
+    Return None if the variances do not grow by MIN_VARIANCE_GROWTH along the path.
+    """
     if variance is None:
         return None
     end_count = max(1, int(END_FRACTION * len(variance)))

@@ -49,7 +49,8 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     return Unavailable(
         "visual-inertial odometry",
         f"the log has no external vision with orientation (position sources: {track_names})",
-        "Send the odometry to PX4 as ODOMETRY, and set SDLOG_PROFILE to 129 to log it.",
+        "Send odometry to PX4 as MAVLink message ODOMETRY, and set SDLOG_PROFILE to 129 to log the "
+        "odometry.",
     )
 
 
@@ -105,8 +106,10 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
     settings = kf_comparison.settings
-    noises = f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m"
-    note = f"KF with the positions {kf_comparison.source.name}, {noises}"
+    note = (
+        f"KF with position source {kf_comparison.source.name}, SIGMA_A {settings.sigma_a_m_s2:g} "
+        f"m/s², SIGMA_Z {settings.sigma_z_m:g} m"
+    )
     return _make_trajectory(flight, "kf", position, flight.attitude, (note,))
 
 
@@ -118,7 +121,7 @@ def _make_trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Make a trajectory at the times of the positions; interpolate the orientations (slerp)."""
+    """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
     samples = finite_rows(samples, Columns.POSITION)
     rotation = None
     rotation_variance = None
@@ -161,7 +164,10 @@ def _make_trajectory(
 
 
 def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
-    """Return the reported variances, shape (n, 3); None if any value is missing."""
+    """Return the reported variances, shape (n, 3).
+
+    Return None if any value is missing.
+    """
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
@@ -197,7 +203,7 @@ def split_part(argument: str) -> tuple[Path, TrackName | None]:
         return Path(path), track_name
     if Path(path).is_file():
         raise TrajectoryError(
-            f"{display_name(Path(path))}: {track_name!r} is not a track of a flight",
+            f"{display_name(Path(path))}: {track_name!r} is not the name of a track in a log",
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     return full_path, None

@@ -16,7 +16,7 @@ _FOREIGN_FORMATS = (
         b"\xa3\x95",
         (),
         "the file is an ArduPilot DataFlash log, not a PX4 ULog",
-        "Give the .tlog that the ground station wrote.",
+        "Give the MAVLink recording (.tlog) of the ground station.",
     ),
     (
         b"%PDF-",
@@ -64,7 +64,9 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(f"{name}: `system` is only for MAVLink recordings.")
+            raise SettingsError(
+                f"{name}: the file is a ULog, but `system` is only for MAVLink recordings."
+            )
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))

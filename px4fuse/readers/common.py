@@ -14,23 +14,26 @@ MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
-# Minimum distance (m) of rows 0, 0, 0 from the positions beside them: 3 σ of good UWB (0.1 m)
+# Minimum distance (m) of a position 0, 0, 0 from its neighbours to reject it as not measured: 3 σ
+# of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum duration (s) of equal positions that are one position held: a source that sends each
-# position several times repeats it for a shorter time
+# Minimum duration (s) of equal positions to reject them as an old position that is sent again: a
+# source that sends each position several times repeats it for a shorter time
 MIN_HELD_S = 1.0
-# Minimum number of equal positions that are one position held
+# Minimum number of equal positions to reject them as an old position that is sent again
 MIN_HELD_COUNT = 5
-# Maximum fraction of held positions: with more, the source is at rest and may repeat its position
+# Maximum fraction of positions that are sent again: with more, the source is at rest and may repeat
+# its position
 MAX_HELD_FRACTION = 0.5
-# Maximum distance (rounding steps) of a difference of values from a whole multiple of the step
+# Maximum deviation (rounding steps) of a difference of two values from a multiple of the rounding
+# step
 MAX_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return those data of a flight that are Unavailable, also inside :class:`Ekf2`."""
+    """Return all :class:`Unavailable` in the data of a flight, also inside :class:`Ekf2`."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusing)
@@ -61,7 +64,7 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Return the sentence that a file ends within a ``unit`` ("frame" or "message")."""
+    """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
     flying = ", in flight" if in_flight else ""
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 
@@ -109,7 +112,10 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
 
 
 def rounding_step(values: Array) -> float:
-    """Return the rounding step: all differences of the values are multiples of it; else 0."""
+    """Return the step of which all differences of the values are multiples.
+
+    Return 0 if there is no such step.
+    """
     steps = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(steps):
         return 0.0
@@ -119,14 +125,20 @@ def rounding_step(values: Array) -> float:
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
-    """Interpolate a time series at times; NaN before its first and after its last sample."""
+    """Interpolate a time series at times.
+
+    The result is NaN before the first and after the last sample.
+    """
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
 def join_nearest(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
-    """Join each row with the other sample nearest in time; NaN if none is within the tolerance."""
+    """Join each row with the row of ``other_samples`` that is nearest in time.
+
+    The added columns are NaN if no row is within the tolerance.
+    """
     return pd.merge_asof(
         samples,
         other_samples,
@@ -138,13 +150,18 @@ def join_nearest(
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a valid quaternion ``w, x, y, z``; an attitude not sent has norm 0."""
+    """Return the rows with a valid quaternion ``w, x, y, z``.
+
+    A quaternion with norm 0 means that the sender sent no attitude.
+    """
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Return the orientation of each sample; None if the orientation never changes.
+    """Return the orientation of each sample.
+
+    Return None if the orientation never changes.
 
     Parameters
     ----------

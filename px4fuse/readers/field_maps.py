@@ -1,6 +1,6 @@
-"""Maps from message fields to DataFrame columns, in the format of two tables.
+"""Maps from message fields to DataFrame columns, as two TOML files define them.
 
-The tables are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
+The files are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ class Layout:
 
 
 def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
-    """Return a :class:`Layout` for each table row; abbreviated column names are expanded."""
+    """Return a :class:`Layout` for each table row, with all column names in full."""
     return {
         name: replace(
             row,
@@ -53,7 +53,7 @@ def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand a row with abbreviated columns to one entry per column.
+    """Expand groups of columns, such as "POSITION", to one entry per column.
 
     Parameters
     ----------

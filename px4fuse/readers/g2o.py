@@ -26,7 +26,7 @@ _TAGS = {
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
-    "other lines."
+    "all other lines."
 )
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
@@ -75,15 +75,17 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     dimension, tag_kind, pose_width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(tag_kind):
-            raise rows.row_error(0, "the file contains both SE2 and SE3", "Use SE2 or SE3.")
+            raise rows.row_error(
+                0, "the file contains SE2 and SE3 poses", "Use only SE2 or only SE3."
+            )
     vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
     edges = rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
-        raise TrajectoryError(f"{name}: the file contains no edges", _REMEDY)
+        raise TrajectoryError(f"{name} contains no edges", _REMEDY)
     edge_vertex_ids, edge_values = _parse(edges, f"EDGE_{tag_kind}")
     ids = np.unique(edge_vertex_ids)
     poses = np.zeros((len(ids), pose_width))
-    poses[:, 6:] = 1.0  # w of the quaternion
+    poses[:, 6:] = 1.0  # the identity rotation has w = 1
     if vertices.lines:
         vertex_ids, poses = _parse(vertices, f"VERTEX_{tag_kind}")
         order = np.argsort(vertex_ids[:, 0], kind="stable")
@@ -91,17 +93,19 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         poses = _normalise_quaternions(vertices, poses)[order]
         is_repeated = np.zeros(len(ids), bool)
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
-        vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
+        vertices.raise_where(
+            is_repeated, "another line has the same vertex id", "Remove one of both lines."
+        )
     vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
         ids[vertex_index] != edge_vertex_ids,
         "the edge connects a vertex that is not in the file",
-        "Add the VERTEX line, or remove all VERTEX lines.",
+        "Add the VERTEX line of this vertex, or remove all VERTEX lines.",
     )
     edges.raise_where(
         edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
         "the edge connects a vertex to itself",
-        "Remove the line.",
+        "Remove this edge.",
     )
     graph = PoseGraph(
         dimension=dimension,
@@ -159,7 +163,7 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
                     name,
                     line_number,
                     "the line fixes a second vertex",
-                    "Remove the line, or connect both vertices by an edge.",
+                    "Remove this line, or connect both vertices by an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             fault = f"lines with the tag {quote(tag)} are not supported"
@@ -182,12 +186,12 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
         "a vertex id is not a 64-bit integer",
         "Give an integer as vertex id.",
     )
-    remedy = "Correct or remove the line."
-    rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
+    remedy = "Correct or remove this line."
+    rows.raise_where(~np.isfinite(numbers), "the line contains a number that is not finite", remedy)
     # The first three numbers are x, y, z (m) or, in SE2, x, y (m) and the angle (rad)
     rows.raise_where(
         np.abs(numbers[:, :3]) >= MAX_COORDINATE_M,
-        f"a position or angle is outside ±{MAX_COORDINATE_M:.0e}",
+        f"a position (m) or angle (rad) is outside ±{MAX_COORDINATE_M:.0e}",
         remedy,
     )
     return cells[:, 1:].astype(np.int64), numbers
@@ -217,8 +221,8 @@ def _information_matrices(rows: Rows, numbers: Array, size: int) -> Array:
     is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
     rows.raise_where(
         is_too_small | (magnitude > _MAX_INFORMATION),
-        "the information matrix has an invalid entry",
-        f"Give 0, or {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
+        "the information matrix contains a number that is too small or too large",
+        f"Give 0, or a number from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     rows.raise_where(

@@ -128,7 +128,8 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     if len(rows) < 2:
         reason = "the recording contains no HIGHRES_IMU or SCALED_IMU"
         if raw_count := len(recording.rows("RAW_IMU")):
-            reason += f"; {raw_count} RAW_IMU messages were not used: raw counts have no unit"
+            raw_note = f"{raw_count} RAW_IMU messages are not used, because raw counts have no unit"
+            reason = f"{reason}; {raw_note}"
         return Unavailable("IMU", reason, remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
@@ -178,19 +179,19 @@ def _read_ekf2(
     if len(state) < 2:
         return Unavailable(
             "EKF2",
-            f"{message} has no finite state",
-            "Wait until EKF2 has started before recording.",
+            f"{message} contains no finite EKF2 state",
+            "Start the recording after EKF2 has started.",
         )
     recording.record_stream("ekf2_state", message)
     notes = [f"the EKF2 state is from {message}, which the autopilot sent"]
     if autopilot != "PX4":
-        notes.append(f"'EKF2' means the estimator of the autopilot {autopilot}")
+        notes.append(f"the name EKF2 stands for the estimator of {autopilot}")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
         notes.append(
             f"EKF2 reset its state {reset_count} times; the resets were not removed, because "
-            "ODOMETRY does not contain their size"
+            "ODOMETRY does not contain the size of a reset"
         )
     variance_rows = samples.reindex(columns=VARIANCE_COLUMNS)
     variance_rows = variance_rows[(variance_rows > 0.0).all(axis=1)]
@@ -254,7 +255,9 @@ def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     states = recording.frames.table("EXTENDED_SYS_STATE", rows)
     is_known = states["landed_state"] > 0
     if not np.any(is_known):
-        return Unavailable("land detector", "EXTENDED_SYS_STATE is missing or not usable", remedy)
+        return Unavailable(
+            "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
+        )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
     landed = pd.Series(states["landed_state"][is_known] == messages.ON_GROUND_STATE, index=time_s)
@@ -277,7 +280,10 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
-    """Read the first value of each parameter; PX4 sends integers as raw bytes in a float field."""
+    """Read the first value of each parameter.
+
+    PX4 sends integers as raw bytes in a float field.
+    """
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     is_sent_as_bytes = (autopilot == "PX4") & (table["param_type"] < REAL32_PARAMETER_TYPE)
     raw_values = np.ascontiguousarray(table["param_value"])
@@ -345,9 +351,10 @@ def _describe_log(
 
 
 def _start_unix_s(recording: Recording) -> float | None:
-    """Return the UNIX time (s) at flight time zero; None if the recording contains no UNIX time.
+    """Return the UNIX time (s) at flight time zero.
 
-    The autopilot's clock is preferred to the clock of the recording computer.
+    The clock of the autopilot is preferred to the clock of the recording computer. Return None if
+    the recording contains no UNIX time.
     """
     if recording.zero_s >= MIN_UNIX_TIME_S:
         return recording.zero_s

@@ -16,8 +16,8 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.log import ClockMap
 
-# Maximum median difference (s) between timestamps of a sender and the boot time of receipt: with a
-# larger difference the timestamps are not boot time
+# Maximum median difference (s) between timestamps of a sender and the receive time since boot: with
+# a larger difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
 # Minimum reduction (s) by TIMESYNC of the difference between timestamps and receive time: with a
 # smaller reduction the sender uses the boot clock
@@ -107,7 +107,7 @@ def fit_least_delay(x: Array, y: Array) -> Line:
 
 
 def _median_slope(x: Array, y: Array) -> float:
-    """Return the Theil-Sen slope of y over x; it is not finite if all x are almost equal."""
+    """Return the Theil-Sen slope of y over x, which is not finite if all x are almost equal."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(theilslopes(y, x)[0])
 
@@ -128,7 +128,7 @@ def robust_std(values: Array) -> float:
 
 @dataclass(frozen=True)
 class ClockMapping:
-    """Map from a sender's timestamps to the boot clock, and its description for results.
+    """Map from the timestamps of a sender to the boot clock, with a description for results.
 
     ``to_boot`` is None if most timestamps are equal; the receive time is then used instead.
     """
@@ -202,7 +202,7 @@ def map_clock(
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
         line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
-        note = "the timestamps of the sender are on the boot clock"
+        note = "the timestamps of the sender are boot times of the autopilot"
         return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
     clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
@@ -222,10 +222,10 @@ def map_clock(
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
-    """Map the sender's clock to the boot clock by TIMESYNC, averaged over both directions.
+    """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions.
 
-    ``replies`` and ``answers`` are pairs of clock readings, see :func:`map_clock`. None if both
-    have fewer than MIN_TIMESYNC_PAIRS.
+    ``replies`` and ``answers`` are pairs of clock readings, see :func:`map_clock`. Return None if
+    both have fewer than MIN_TIMESYNC_PAIRS readings.
     """
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:

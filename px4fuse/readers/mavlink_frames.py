@@ -22,7 +22,7 @@ from px4fuse.core.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
 Integers = NDArray[np.int64]
-# (MAVLink system id, MAVLink component id)
+# Address of a sender: MAVLink system id and component id
 Address = tuple[int, int]
 
 MAGIC_BYTE_1, MAGIC_BYTE_2 = 0xFE, 0xFD
@@ -108,7 +108,7 @@ class Frames:
         return len(self.start)
 
     def rows(self, message: str) -> IntArray:
-        """Return the indices of the frames of one message, given its MAVLink name."""
+        """Return the indices of the frames with one message; ``message`` is the MAVLink name."""
         return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
 
     def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
@@ -158,7 +158,8 @@ def message_name(message_id: int) -> str:
 def wire_layout(message_id: int) -> np.dtype[Any]:
     """Return the payload layout of a message id as a packed structured dtype."""
     message = dialect.mavlink_map[message_id]
-    type_codes = message.native_format.decode().removeprefix("<")  # numpy has the same type codes
+    # pymavlink and numpy have the same type codes
+    type_codes = message.native_format.decode().removeprefix("<")
     fields: list[Any] = []
     for name, type_code, length in zip(
         message.ordered_fieldnames, type_codes, message.array_lengths, strict=True
@@ -242,8 +243,8 @@ def _find_valid_frames(content: bytes) -> Integers:
 def _remove_nested_frames(frames: Integers) -> Integers:
     """Remove frames that begin inside the previous frame.
 
-    The payload of one frame may contain another frame (TUNNEL). A receive time can look like the
-    beginning of a frame. Such a false frame must not remove the true frame after the receive time.
+    The payload of a frame may contain another frame (message TUNNEL). A receive time may look like
+    the header of a frame. Such a false frame must not remove the frame after the receive time.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -371,14 +372,15 @@ def _read_receive_times(
     raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
         :, 0
     ]
-    received_us = raw_us.astype(np.int64)  # values above 1 << 63 become negative: invalid
+    # values above 1 << 63 become negative and are then invalid
+    received_us = raw_us.astype(np.int64)
     is_usable &= (received_us >= 0) & (received_us < 1 << 62)
     median_us = int(np.median(received_us[is_usable])) if np.any(is_usable) else 0
     is_usable &= np.abs(received_us - median_us) <= MAX_RECEIVE_TIME_DISTANCE_US
     received_us = np.where(is_usable, received_us, 0)
     if np.any(is_usable):
         rows = np.flatnonzero(is_usable)
-        # Relative to the first receive time, so that float64 resolves microseconds
+        # Times are relative to the first receive time, so that float64 resolves microseconds
         since_first_us = np.interp(
             np.arange(len(start)), rows, received_us[rows] - received_us[rows[0]]
         )

@@ -66,7 +66,7 @@ class PositionInput:
 
     @property
     def layout(self) -> Layout:
-        """Message with its fields and their DataFrame columns."""
+        """Fields of the message and the DataFrame columns to which they are converted."""
         return LAYOUTS[self.row]
 
     @property
@@ -82,7 +82,7 @@ class PositionInput:
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """Order and signs of the components of a MAV_FRAME along the axes of ``name``: NED or FRD."""
+    """Conversion of vectors in a MAV_FRAME to NED or FRD: order and signs of the components."""
 
     name: str
     order: tuple[int, int, int] = (0, 1, 2)
@@ -112,7 +112,7 @@ GNSS_LAYOUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return the action to record each kind of missing data, and the reason for no EKF2 replay."""
+    """Return the actions to record missing data, and the reason why EKF2 cannot be replayed."""
     if autopilot == "ArduPilot":
         return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
     return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED

@@ -21,8 +21,8 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# Maximum median difference (s) between GNSS timestamps and the boot time of receipt: with a larger
-# difference the timestamps are not boot time
+# Maximum median difference (s) between GNSS timestamps and the receive time since boot: with a
+# larger difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
 # Maximum time difference (s) between a global and a local position to compute the origin: an error
 # of 5 cm at 1 m/s
@@ -55,7 +55,7 @@ def read_positions(
         ]
         tracks_and_missing += tracks or [
             px4_positions.unavailable(
-                message, f"the recording contains no {message} to the autopilot", remedy
+                message, f"the recording contains no {message} sent to the autopilot", remedy
             )
         ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
@@ -71,7 +71,10 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions in one message type from one sender; None if the sender sent none."""
+    """Read the positions in one message type from one sender.
+
+    Return None if the sender sent no such message.
+    """
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -117,10 +120,9 @@ def _read_gnss(
 ) -> PositionTrack | Unavailable | None:
     """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
 
-    1. PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
-       next one.
-    2. px4fuse selects GNSS by default only if the autopilot sends a global position.
-    3. The result is None without messages.
+    PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
+    next one. px4fuse selects GNSS by default only if the autopilot sends a global position. Return
+    None without messages.
     """
     rows = recording.rows(layout.topic)
     count = len(rows)

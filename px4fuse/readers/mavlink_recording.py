@@ -33,7 +33,8 @@ RESTART_CHECK_MESSAGES = 20
 # Minimum size of a group of timestamps between two gaps, as fraction of the largest group: smaller
 # groups are damaged timestamps
 MIN_GROUP_FRACTION = 0.01
-# Maximum distance (s) of valid timestamps from each other, and from the analysed session
+# Maximum interval (s) between valid timestamps, and maximum distance (s) of valid timestamps from
+# the analysed session
 MAX_OUTSIDE_S = 60.0
 # Maximum fraction of bytes outside of MAVLink frames in a file without damage
 MAX_LOST_FRACTION = 0.002
@@ -114,7 +115,7 @@ class Recording:
         rows : ndarray, shape (n,), optional
             Frame indices from :meth:`rows`; by default all from the autopilot.
         boot_s : ndarray, shape (n,), optional
-            Boot times; a sample with NaN is dropped. By default the timestamps of the messages.
+            Times since boot; NaN drops a sample. By default the timestamps of the messages.
         name : str, optional
             Key in :attr:`dropped`; by default the message name.
         """
@@ -146,7 +147,7 @@ class Recording:
         return _to_ned(samples) if "frame_id" in samples else samples
 
     def _select_rows(self, name: str, boot_s: Array) -> IntArray:
-        """Return the indices of valid, strictly increasing boot times; count the dropped ones."""
+        """Return the indices of valid and increasing boot times; count all others as dropped."""
         time_s = boot_s - self.zero_s
         is_inside = (time_s >= -MAX_OUTSIDE_S) & (time_s <= self.duration_s + MAX_OUTSIDE_S)
         rows = np.flatnonzero(is_inside & (boot_s > 0.0))
@@ -160,11 +161,14 @@ class Recording:
         return selected_rows
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Return the boot time (s) of receipt, minus the minimum link delay."""
+        """Return the receive time since boot (s) of frames, minus the minimum link delay."""
         return self.boot_of_receipt.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the boot time (s) of autopilot messages: timestamps, or else receive times."""
+        """Return the time since boot (s) of autopilot messages.
+
+        Messages without timestamp have their receive time.
+        """
         if not self.boot_of_receipt.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
@@ -183,7 +187,9 @@ class Recording:
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
-    """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
+    """Convert ODOMETRY samples to NED (or FRD).
+
+    Values in unsupported frames become NaN.
 
     The velocity is in the child frame of the message: the body frame in PX4 up to v1.13, NED later
     (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
@@ -223,7 +229,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
-    """Return the indices of the autopilot's frames with a boot time, and these boot times (s)."""
+    """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
     is_from_autopilot = frames.sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
     all_times_s = [np.zeros(0)]
@@ -276,9 +282,9 @@ def read_recording(frames: Frames, address: Address) -> Recording:
             int(rows[-1]) + 1 if index < len(restarts) else len(frames),
         )
         notes.append(
-            f"restarts of the boot clock: {len(restarts)}; session {index + 1} of "
-            f"{len(restarts) + 1} is used, {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
-            f"({used_fraction:.0%} of the data)"
+            f"restarts of the boot clock: {len(restarts)}; only session {index + 1} is analysed, "
+            f"from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot ({used_fraction:.0%} of the "
+            "data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
@@ -297,14 +303,14 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         )
         received_s = boot_s[previous_row]
     else:
-        notes.append("the messages in the stream contain no time")
+        notes.append("no message in the stream contains a time")
     receipt_reversals = int(np.count_nonzero(np.diff(received_s) < 0.0))
     if unknown_count := frames.unknown_frame_count:
-        notes.append(f"ignored frames of unknown message types: {unknown_count}")
+        notes.append(f"number of ignored frames with unknown message type: {unknown_count}")
     if damaged_count := frames.damaged_receive_times:
-        notes.append(f"damaged receive times that were interpolated: {damaged_count}")
+        notes.append(f"number of damaged receive times that were interpolated: {damaged_count}")
     if receipt_reversals:
-        notes.append(f"backward steps of the receive time: {receipt_reversals}")
+        notes.append(f"number of backward jumps of the receive time: {receipt_reversals}")
     lost_fraction = frames.bad_bytes / len(frames.content)
     lost_text = (
         f"{frames.bad_bytes:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink frame"
@@ -345,7 +351,10 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 
 def map_boot_to_unix(recording: Recording) -> Line | None:
-    """Map the boot clock to UNIX time by SYSTEM_TIME; None if SYSTEM_TIME has no UNIX time."""
+    """Map the boot clock to UNIX time by SYSTEM_TIME.
+
+    Return None if SYSTEM_TIME contains no UNIX time.
+    """
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     boot_s = table["time_boot_ms"] * 1e-3
     unix_s = table["time_unix_usec"] * 1e-6

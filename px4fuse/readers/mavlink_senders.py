@@ -86,8 +86,8 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
         if not candidates:
             ids = ", ".join(map(str, sorted({s[0] for s in vehicle_addresses}))) or "none"
             raise SettingsError(
-                f"{frames.name}: no autopilot has MAVLink system id {system}. Autopilots in "
-                f"this file: {ids}."
+                f"{frames.name}: no autopilot has MAVLink system id {system}. System ids of "
+                f"autopilots in this file: {ids}."
             )
     best_address = max(candidates, key=lambda address: counts.get(address, 0))
     name = messages.AUTOPILOTS.get(vehicles[best_address][1]) if best_address in vehicles else None
@@ -95,7 +95,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of a message, except this vehicle's autopilot and other vehicles."""
+    """Return the senders of a message, except autopilots of this and other vehicles."""
     frames = recording.frames
     own_address = recording.address
     other_vehicles = {
@@ -181,7 +181,8 @@ def clock_maps(
         note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = (
-                "from the messages with least delay, used only to order messages and to map clocks"
+                "estimated from the messages with the least delay, and used only to order messages "
+                "and to map clocks"
             )
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         name = "receive time (UNIX time of the recording computer)"
@@ -213,8 +214,8 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 def _lost_fraction(frames: Frames, address: Address) -> float | None:
     """Return the fraction of a sender's messages that are missing, from the sequence numbers.
 
-    Repeated and slightly late messages are not lost. None if the sender does not set sequence
-    numbers, or sets them separately on two links.
+    Repeated and slightly late messages are not lost. Return None if the sender does not set
+    sequence numbers, or sets them separately on two links.
     """
     sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
     step = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES

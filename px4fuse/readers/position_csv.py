@@ -82,7 +82,7 @@ class PositionRecording:
     metres_per_unit : float
         Factor that was applied to the first position column.
     invalid : Series
-        Rows that are no measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
+        Rows without a measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
     step_m : float
         Rounding step of the coarsest horizontal coordinate; 0 if there is none.
     """
@@ -103,7 +103,7 @@ class PositionRecording:
 
 @dataclass(frozen=True)
 class _Table:
-    """Table in a text file: column names, and ``body``, the text of the lines below the header."""
+    """Table in a text file: column names, and the text of the lines below the header (``body``)."""
 
     file_name: str
     separator: str
@@ -112,7 +112,7 @@ class _Table:
     header_line: int
 
     def label(self, *columns: int | None) -> str:
-        """Format the names of columns for messages, each once; skip None."""
+        """Join the names of columns for messages, without repeated columns and None."""
         labels = dict.fromkeys(
             quote(self.names[index]) if self.names[index] else f"column {index + 1}"
             for index in columns
@@ -121,7 +121,7 @@ class _Table:
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of the columns as text, without empty rows."""
+        """Return the cells of the columns as text, without rows in which all cells are empty."""
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -178,7 +178,9 @@ def read_position_csv(
     """
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
-    content = read_bytes_limited(path, LogError, MAX_FILE_BYTES, empty_remedy="Copy it again")
+    content = read_bytes_limited(
+        path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
+    )
     table, notes = _find_table(display_name(path), content, columns)
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
@@ -194,13 +196,14 @@ def read_position_csv(
     has_time = np.isfinite(numbers[time])
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.insert(0, f"dropped rows without valid time or position: {unusable_count}")
+        notes.insert(0, f"number of dropped rows without valid time or position: {unusable_count}")
     empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
     for tag in (index for index, meaning in enumerate(meanings) if meaning.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
             notes.append(
-                f"the file contains {len(tags)} tags (such as {quote(tags[0])}): keep one only"
+                f"the position file contains {len(tags)} tags (such as {quote(tags[0])}): remove "
+                "all tags but one"
             )
     numbers = numbers[is_usable]
     times = numbers[time].to_numpy()
@@ -209,25 +212,31 @@ def read_position_csv(
     units_per_second = round(1.0 / TIME_UNITS[unit])
     seconds = times / units_per_second
     usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # Ranks instead of times, because the function requires positive values
+    # Ranks are used instead of times, because longest_increasing_run requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
     kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
     if dropped := len(seconds) - len(kept_rows):
         notes.append(
-            f"dropped rows with timestamps that repeat, decrease or are after 2100: {dropped}"
+            "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
+            f"{dropped}"
         )
     if len(kept_rows) < MIN_ROWS:
         raise LogError(
-            f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
-            f"needed{''.join('; ' + note for note in notes)}",
-            f"Use decimal points, or name the columns with {_COLUMNS_OPTION}.",
+            "; ".join(
+                [
+                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
+                    f"{MIN_ROWS}",
+                    *notes,
+                ]
+            ),
+            f"Write numbers with decimal points, or name the columns with {_COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
     median_interval_s = median_interval(numbers.index)
     if not MIN_INTERVAL_S <= median_interval_s <= MAX_INTERVAL_S:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is not plausible for UWB: check "
-            "--position-time-unit"
+            "the unit of time (--position-time-unit)"
         )
     scale_by_column, length_unit_text = _length_units(numbers, axes, meanings, length_unit)
     columns_m = {
@@ -240,7 +249,7 @@ def read_position_csv(
     samples = samples[reason == ""]
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if bad_row_count := int(is_not_positive.any(axis=1).sum()):
-        notes.append(f"ignored sigmas that are zero or negative: {bad_row_count}")
+        notes.append(f"number of ignored sigmas that are zero or negative: {bad_row_count}")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
@@ -257,9 +266,9 @@ def read_position_csv(
         detected=(
             f"the separator is {_SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
-            f"time: column {time_text}, {clock} clock, in {unit_text}",
-            f"position: columns {table.label(*position)} as {axis_names}{height_text}, in "
-            f"{length_unit_text}",
+            f"time: column {time_text}, {clock} clock, unit {unit_text}",
+            f"position: columns {table.label(*position)} as {axis_names}{height_text}, "
+            f"unit {length_unit_text}",
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
@@ -296,7 +305,10 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_table(
     file_name: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
-    """Find the table in a text file; also return a note if an incomplete last line was dropped."""
+    """Find the table in a text file.
+
+    Also return a list with a note if an incomplete last line was dropped.
+    """
     text = decode_text(content)
     if text is None:
         raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
@@ -304,7 +316,7 @@ def _find_table(
     whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
     if last_line.strip():
-        notes.append("the last line was dropped, because it has no line end")
+        notes.append("the last line of the position file was dropped, because it has no line end")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
@@ -328,7 +340,7 @@ def _find_table(
     if row_width > len(names):
         raise LogError(
             f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
-            "Use decimal points, and name each column.",
+            "Write numbers with decimal points, and give each column a name.",
         )
     return _Table(file_name, separator, names, body, header_line), notes
 
@@ -371,11 +383,11 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; also return frame and time description.
+    """Choose the columns of time, position and sigma.
 
-    1. Columns that the user chose are used.
-    2. Otherwise the names determine the columns. A non-empty column with the time of measurement is
-       preferred to a column with the time of recording.
+    Also return the frame, and the description of the time column. Columns that the user chose are
+    used. Otherwise the column names determine the columns. A column with the time of measurement is
+    preferred to a column with the time of recording if it is not empty.
     """
     if chosen_columns:
         time = chosen_columns[0]
@@ -399,7 +411,7 @@ def _choose_columns(
         )
         time_text = table.label(time)
         if other_times:
-            time_text += f", the {meanings[time].key} (not used: {table.label(*other_times)})"
+            time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
         frame, position = position_names.find_position(meanings) or (None, ())
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
@@ -412,7 +424,7 @@ def _choose_columns(
 
 
 def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, str]:
-    """Return the unit of the time column and its description."""
+    """Return the unit of the time column, and a text with the reason for this unit."""
     if option is not None:
         return option, f"{option} (given with --position-time-unit)"
     median = float(np.median(times)) if len(times) else 0.0
@@ -424,25 +436,29 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, f"{unit} (from the magnitude of UNIX time)"
+            return unit, f"{unit} (because the times are then UNIX times)"
         if MIN_INTERVAL_S <= median_step * scale <= MAX_INTERVAL_S:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s (assumed, because no unit gives a plausible UWB rate; "
-            "--position-time-unit sets another unit)"
+            "s (assumed, because no unit gives a plausible UWB rate; set another unit with "
+            "--position-time-unit)"
         )
     unit = plausible_units[0]
-    description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
+    description = (
+        f"{unit} (because the median interval is then {median_step * TIME_UNITS[unit]:.3g} s)"
+    )
     if plausible_units[1:]:
-        description += f"; if {plausible_units[1]}, give --position-time-unit"
+        description = (
+            f"{description}; if the unit is {plausible_units[1]}, give --position-time-unit"
+        )
     return unit, description
 
 
 def _length_units(
     numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
 ) -> tuple[dict[int, float], str]:
-    """Return metres per unit of each column, and the description of the unit of the positions."""
+    """Return metres per unit of each column, and a text with the unit of the positions."""
     name_units = {
         index: meaning.unit
         for index, meaning in enumerate(meanings)
@@ -452,22 +468,25 @@ def _length_units(
     extents = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
-    reason = "assumed: the column names contain no unit"
+    reason = "assumed, because the column names contain no unit"
     if option is not None:
         unit = option
         name_units = {}
-        reason = "given with --position-unit"
+        reason = "the unit was given with --position-unit"
     elif axis_units := [name_units[index] for index in axes if index in name_units]:
         unit = axis_units[0]
         reason = "from the column names"
     elif MAX_INDOOR_EXTENT_M < max_extent <= MAX_INDOOR_EXTENT_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
-            f"{max_extent:.0f} m is too large for an indoor flight; if the unit is cm, give "
-            "--position-unit"
+            f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
+            "cm, give --position-unit"
         )
     elif max_extent > MAX_INDOOR_EXTENT_M:
-        reason = "assumed, as no unit gives an indoor flight; --position-unit sets another unit"
+        reason = (
+            "assumed, because no unit gives the extent of an indoor flight; set another unit with "
+            "--position-unit"
+        )
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
     span_m = max(float(extents[index]) * scale_by_column[index] for index in axes)

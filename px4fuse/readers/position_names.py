@@ -17,11 +17,11 @@ _UNITS, _AXES = (
     {
         word: meaning
         for meaning, column_words in _TABLE[group].items()
-        for word in column_words.split()
+        for word in column_words.split(",")
     }
     for group in ("units", "axes")
 )
-_ROLES = {role: {*column_words.split()} for role, column_words in _TABLE["roles"].items()}
+_ROLES = {role: {*column_words.split(",")} for role, column_words in _TABLE["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
@@ -40,7 +40,7 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Meaning of one column name; all fields are "" for an unknown name.
+    """Meaning of one column name; all fields are empty strings if the name is unknown.
 
     Attributes
     ----------
@@ -89,9 +89,10 @@ def read_column_name(name: str) -> ColumnMeaning:
 
 
 def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
-    """Return frame and column indices of the position; None if the file has no position.
+    """Return frame and column indices of the position.
 
-    A position with height is preferred to a position without height.
+    A position with height is preferred to a position without height. Return None if the file has no
+    position.
     """
     groups: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
@@ -106,7 +107,7 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the index of the sigma column of each axis, or of the sigma column without axis."""
+    """Return the index of the sigma column of each axis, or of the sigma column for all axes."""
     sigmas: dict[str, int] = {}
     for index, meaning in enumerate(meanings):
         if meaning.kind == "sigma":

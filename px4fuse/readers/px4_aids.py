@@ -30,7 +30,8 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
     ``enabled_aids`` is the result of :func:`read_enabled_aids`. A topic ``estimator_aid_src_...``
     is preferred: it contains each fusion attempt with time and result. The older topics that are
-    common to all aids repeat each value until the next fusion; repeated values are removed.
+    common to all aiding sources repeat each value until the next fusion. Repeated values are
+    removed.
     """
     logs = {}
     for name, aid in AIDS.items():
@@ -46,7 +47,7 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """Read a step function for each aiding source: 1 while its fusion is enabled, otherwise 0.
+    """Read a step function for each aiding source: 1 while EKF2 enables fusion, otherwise 0.
 
     The source is ``estimator_status_flags``, or the control bits of ``estimator_status`` in older
     logs.
@@ -134,7 +135,7 @@ def _read_common_topics(
 
 
 def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
-    """Remove repeated rows, and rows of zeros, which mean "not fused yet"."""
+    """Remove repeated rows, and rows of zeros, which PX4 logs before the first fusion."""
     finite_samples = samples.dropna()
     first_column = finite_samples.iloc[:, 0]
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
@@ -162,9 +163,10 @@ def _make_aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Build the log of an aiding source from rows with positive variance; None without such rows.
+    """Build the log of an aiding source from the rows with positive innovation variance.
 
-    Innovations are negated, because PX4 logs predicted minus measured.
+    Return None without such rows. Innovations are negated, because PX4 logs predicted minus
+    measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:

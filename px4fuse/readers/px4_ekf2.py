@@ -40,8 +40,8 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance (IMU samples) between prediction interval and n + 0.5 samples with which EKF2 may
-# round to n as well as to n + 1 samples
+# Maximum deviation (IMU samples) of the prediction interval from n + 0.5 IMU samples for which EKF2
+# may round to n or to n + 1
 MAX_HALF_DISTANCE = 0.05
 # Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
 # between them
@@ -87,7 +87,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         return Unavailable(
             "EKF2",
             "vehicle_local_position has no finite sample",
-            "Wait until EKF2 has started before recording.",
+            "Start the recording after EKF2 has started.",
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled_aids = read_enabled_aids(topics)
@@ -145,9 +145,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with the state vector of EKF2, and its number of attitude variances.
+    """Return the topic with EKF2's state vector, and the number of attitude variances in it.
 
-    The topic is "" if it is not logged. The number is 0 if the array lengths are unknown.
+    The topic is an empty string if it is not logged. The number is 0 if the array lengths are
+    unknown.
     """
     for topic in px4.ESTIMATOR_STATES:
         for table in topics.of(topic)[:1]:
@@ -170,8 +171,8 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     if not attitude:
         return Unavailable(
             "EKF2 variances",
-            f"{topic} has unknown array lengths",
-            "Report the PX4 version in a px4fuse issue.",
+            f"{topic} has arrays of unknown length",
+            "Report the PX4 version in an issue of px4fuse.",
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
     variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude)]
@@ -207,7 +208,7 @@ def _step_s(topics: Topics) -> float:
 
 
 def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
-    """Return the indices of the ``times_s`` that are also in ``other_s``, compared in whole µs."""
+    """Return the indices of the ``times_s`` that are also in ``other_s``, compared in µs."""
     return np.flatnonzero(
         np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(other_s, dtype=float) * 1e6))
     )
@@ -282,7 +283,9 @@ def _read_fusing(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavaila
     flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     if flags.empty:
-        return Unavailable("EKF2 fusion flags", f"{topic} has no usable sample", "Record again.")
+        return Unavailable(
+            "EKF2 fusion flags", f"{topic} has no usable sample", "Record the flight again."
+        )
     topics.record_stream("ekf2_fusing", topic)
     return flags
 
@@ -310,7 +313,10 @@ def _read_record(
     enabled_aids: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
-    """Read the data for a replay of EKF2; ``local_samples``: published local position."""
+    """Read the data for a replay of EKF2 from the fusion horizon.
+
+    ``local_samples`` are the samples of EKF2's published local position.
+    """
     topic, attitude = _state_vector(topics)
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed_state, Unavailable):
         return flight.RECORD_NOT_LOGGED
@@ -356,13 +362,13 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 
 
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the magnetic field from one of the two topics that contain it.
+    """Read the magnetic field, either from the magnetometer or from EKF2's observation.
 
     A topic with all samples that EKF2 uses is preferred, then a topic with EKF2's low-pass filtered
     innovation.
     """
     candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETOMETER]
-    # EKF2 subtracts its delay and half a step from the times of its observations
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
     shift_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     candidates[1] = candidates[1].set_axis(candidates[1].index + shift_s)
     complete = [

@@ -13,8 +13,8 @@ from px4fuse.readers.ulog_topics import Topics
 # Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
 # send a fix every 0.05 s or less often
 MAX_SAME_FIX_S = 0.01
-# Maximum difference (°, about 100 km) between the observed and the logged latitude: a larger
-# difference shows that the observation is in m
+# Maximum difference (°, about 100 km) of observed and logged latitude: a larger difference shows
+# that the observation is in m
 MAX_LATITUDE_DISTANCE_DEG = 1.0
 # Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
 FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)

@@ -15,9 +15,10 @@ Innovations = dict[AxisName, TableOrUnavailable]
 
 @dataclass(frozen=True)
 class Ekf2Source:
-    """Position source of EKF2, its aids by PX4 name, and actions to enable and to log these aids.
+    """Position source as which EKF2 fuses positions, with the names of its aiding sources in PX4.
 
-    ``height`` is the name of a separate height sensor; "" if the source also gives the height.
+    ``height`` is the name of a separate height sensor; it is empty if the source also gives the
+    height. ``remedies`` are the actions to enable fusion, and ``to_log`` is the action to log it.
     """
 
     name: str
@@ -42,7 +43,10 @@ GNSS_AND_BAROMETER = replace(
 
 
 def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
-    """Return True if EKF2 fused the aid at any time, or enabled it if fusion is not logged."""
+    """Return True if EKF2 fused the aiding source at any time.
+
+    If the log contains no fusion flags, return True if EKF2 enabled the aiding source.
+    """
     if isinstance(ekf2, Unavailable):
         return False
     log = ekf2.aids.get(aid)

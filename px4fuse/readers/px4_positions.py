@@ -43,14 +43,15 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# Maximum delay (µs) from timestamp to publication of a sample whose timestamp is the arrival time
+# Maximum delay (µs) from timestamp to publication for which the timestamp is the arrival time
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of arrival times among the timestamps of a topic that has no measurement times
+# Minimum fraction of arrival times among the timestamps of a topic to report that the topic has no
+# measurement times
 MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is added:
 # 2.5 cm error at a climb rate of 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum rate (Hz) of GNSS fixes in a log with missing fixes: receivers send 5 to 20 per second
+# Maximum rate (Hz) of logged GNSS fixes to report missing fixes: receivers send 5 to 20 per second
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each unit of timestamps
@@ -90,7 +91,7 @@ def split_tracks(
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
-    """Describe a missing position source; the default ``remedy`` is from ``px4_topics.toml``."""
+    """Describe a missing position source; the default action is from ``px4_topics.toml``."""
     remedy = remedy or px4.TRACKS[name].remedy
     return Unavailable(f"position source {name}", reason, remedy, source=name)
 
@@ -104,7 +105,9 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track of the valid samples; Unavailable with fewer than three valid samples.
+    """Make a position track from valid samples.
+
+    The result is Unavailable with fewer than three valid samples.
 
     Parameters
     ----------
@@ -127,7 +130,7 @@ def make_track(
     if len(samples) < MIN_TRACK_SAMPLES:
         return unavailable(
             name,
-            f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)",
+            f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}",
             remedy,
         )
     variance = samples[Columns.POSITION_VARIANCE]
@@ -151,7 +154,7 @@ def _make_ulog_track(
     turns: bool = False,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a ULog track; ``turns`` is True if the source has a changing orientation."""
+    """Make a ULog track; ``turns`` is True if the source sends a changing orientation."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
     if origin.aid is not None:
@@ -193,10 +196,11 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic whose timestamps are no measurement times; None for others.
+    """Describe the clock of a topic whose timestamps are not measurement times.
 
     PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
-    uses it if ``timestamp_sample`` is not the boot clock in microseconds.
+    uses the arrival time if ``timestamp_sample`` is not boot time in microseconds. Return None if
+    the timestamps are measurement times.
     """
     table = topics.of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -206,10 +210,10 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     age_us = published_us - sampled_us
     if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_FRACTION:
         clock = SENDER_CLOCK
-        note = "PX4 replaced the timestamps by arrival times: the clocks were not synchronised"
+        note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
         clock = _stamp_clock(published_us, sampled_us)
-        note = "timestamp_sample is not the autopilot's clock in microseconds"
+        note = "timestamp_sample does not contain boot times in microseconds"
     elif (distinct := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
         return ClockMap(
             SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, SHARED_STAMPS, distinct
@@ -244,7 +248,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
     if vertical is not None:
         samples, notes = _with_height(samples, topics.primary_samples(vertical))
         used_topics.append(vertical.topic)
-    # EKF2 subtracts its delay and half its prediction interval from the sender's timestamp
+    # EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
     samples = _shift_times(samples, _delay_s(topics) + 0.5 * configured_step_s(topics))
     return _make_ulog_track(
@@ -265,10 +269,10 @@ def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height in time to each horizontal position; note the missing heights.
+    """Add the height that is nearest in time to each horizontal position.
 
-    Height and horizontal position of a vision sample have the same timestamp, but the logger
-    decimates their topics separately.
+    Also return a note on positions without height. Height and horizontal position of a vision
+    sample have the same timestamp, but the logger decimates both topics separately.
     """
     joined = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
     without_height = int(joined.pop("_found").isna().sum())
@@ -314,7 +318,7 @@ def _reconstruct(
         turns=turns,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
-        clock=f"EKF2 time plus {EV_POS.delay}; late by up to one interval of the source",
+        clock=f"innovation time plus {EV_POS.delay}, late by up to one interval of the source",
     )
 
 
@@ -356,7 +360,10 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 
 def _local_origin(topics: Topics) -> GeodeticPosition | None:
-    """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None without an origin."""
+    """Return EKF2's origin: latitude, longitude (degrees), altitude (m).
+
+    Return None if the log contains no origin.
+    """
     columns = ["ref_lat", "ref_lon", "ref_alt"]
     origin = finite_rows(topics.read(px4.LOCAL_POSITION).reindex(columns=columns), columns)
     origin = origin[origin["ref_lat"] != 0]
@@ -366,7 +373,7 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    Without an origin, the first sample is used.
+    If ``origin`` is None, the first sample is the origin.
     """
     latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
@@ -389,14 +396,14 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
-        return unavailable(px4.GPS_POSITION, "the receiver never had a 3D fix")
+        return unavailable(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE in parameters and bool(
         np.any(published_s - gps.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
     delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
-    clock = "autopilot boot clock, measurement times of the receiver driver"
+    clock = "autopilot boot clock, measurement times from the GNSS driver"
     if not has_driver_times:
         gps = gps.set_axis(time_index(published_s - delay_ms * 1e-3))
         clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
@@ -411,8 +418,8 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    # The velocity is added before the check, so that it is dropped together with a damaged position
-    # The variance per axis is the reported accuracy squared
+    # The velocity is added before the check, so that it is dropped together with a damaged
+    # position. Its variance per axis is the reported accuracy squared
     velocity = gps.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
     accuracy = gps.get("speed_accuracy_m_s", pd.Series(np.nan, gps.index)).to_numpy()
     samples = samples.assign(**velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
@@ -422,7 +429,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if rate_hz < MAX_DOWNSAMPLED_HZ:
         notes.append(
             f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
-            "1 to log all"
+            "1 to log all fixes"
         )
     if len(unlogged_fixes):
         notes.append(
@@ -435,7 +442,8 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
             notes.append(note)
     track_fields: dict[str, Any] = {}
-    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # logged per receiver since v1.17
+    # the lever arm of each receiver is logged since v1.17
+    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):
         track_fields["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     track = _make_ulog_track(
         topics,
@@ -455,7 +463,10 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None below three samples."""
+    """Return the barometer height as column ``down_m``, with times that are ``delay_s`` earlier.
+
+    Return None with fewer than three samples.
+    """
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
@@ -509,7 +520,12 @@ def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Return motion capture as ground truth if the log also has external vision, else None."""
+    """Return motion capture as ground truth if the log also contains external vision.
+
+    Otherwise return None.
+
+    Otherwise EKF2 may have fused motion capture, and the result is None.
+    """
     track = next((track for track in positions if track.topics[0] == topic), None)
     if track is None or not any(track.origin.is_vision for track in positions):
         return None

@@ -26,9 +26,10 @@ _NUMBER = re.compile(
 
 
 def decode_text(content: bytes) -> str | None:
-    """Decode text and convert its line ends to line feeds; None if the content is binary.
+    """Decode text and convert its line ends to line feeds.
 
-    The encoding is UTF-8, UTF-16 with byte order mark, or Latin-1 for all other bytes.
+    The encoding is UTF-8, UTF-16 with byte order mark, or Latin-1 for all other bytes. Return None
+    if the content is binary.
     """
     if content.startswith(_UTF_16_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
@@ -56,7 +57,7 @@ def quote(text: str) -> str:
 def line_error(name: str, number: int, fault: str, remedy: str) -> TrajectoryError:
     """Make an error about one line of a file.
 
-    >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove that line."))
+    >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
     """
     return TrajectoryError(f"{name}, line {number}: {fault}. {remedy}")
@@ -90,7 +91,9 @@ class Rows:
     def parse(
         self, words: int, values: int, separator: str | None = None
     ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Parse rows of word columns followed by number columns; ``#`` begins a comment.
+        """Parse rows in which columns of words precede columns of numbers.
+
+        A ``#`` begins a comment.
 
         Parameters
         ----------
@@ -124,7 +127,7 @@ class Rows:
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             raise self.row_error(
                 row,
-                f"{quote(texts[row])} is not {words + values} columns of numbers",
-                "Correct or remove that line.",
+                f"{quote(texts[row])} does not have {words + values} columns of numbers",
+                "Correct or remove this line.",
             ) from error
         return table["words"], np.ascontiguousarray(table["values"])

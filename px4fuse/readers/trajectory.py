@@ -26,8 +26,8 @@ TUM_COLUMNS = 8
 # Numbers of columns in EuRoC files: pose only, or also velocity and biases of gyro and
 # accelerometer
 EUROC_COLUMNS = (8, 17)
-# Maximum median interval (s) between poses without a note on the unit of time: a longer interval
-# may be in milliseconds
+# Maximum median interval (s) between poses that is not reported as doubtful: a longer interval may
+# be in milliseconds
 MAX_USUAL_INTERVAL_S = 10.0
 # Maximum plausible median interval (s) between poses: key frames may have minutes between them
 MAX_INTERVAL_S = 1000.0
@@ -43,7 +43,7 @@ UNIT_NORM_TOLERANCE = 1e-15
 # Maximum fraction of repeated timestamps: a larger fraction shows that timestamps have too few
 # digits
 MAX_REPEATED_FRACTION = 0.01
-# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity
+# Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
 MAX_IDENTITY = 1e-6
 # Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
 MAX_THICKNESS_RATIO = 1 / 3
@@ -55,9 +55,9 @@ MAX_TILT_RAD = math.radians(20.0)
 MIN_REGULAR_FRACTION = 0.9
 # Maximum relative deviation of a regular interval from the median interval
 MAX_INTERVAL_DEVIATION = 0.5
-# Minimum length of a gap between poses (median intervals)
+# Minimum interval between two poses that counts as a gap, in median intervals
 MIN_GAP_INTERVALS = 2.5
-# Minimum length (s) of a gap between poses
+# Minimum interval (s) between two poses that counts as a gap
 MIN_GAP_S = 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
@@ -65,7 +65,7 @@ _EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
 # Column names of quaternion components in EuRoC headers, such as "q_RS_w []" and "qw"
 _QUATERNION_NAME = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
 _TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
-_REMEDY = f"Export the trajectory as {_TUM}, in seconds."
+_REMEDY = f"Export the trajectory in the format {_TUM} with times in seconds."
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -93,7 +93,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     path = Path(path)
     name = display_name(path)
     content = read_bytes_limited(
-        path, TrajectoryError, MAX_FILE_BYTES, empty_remedy="Export it again"
+        path, TrajectoryError, MAX_FILE_BYTES, empty_remedy="Export the trajectory again."
     )
     rows, comments, truncation_note = _split_rows(name, content)
     first_row = rows.lines[0][1].partition("#")[0]
@@ -111,8 +111,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
     rows.raise_where(
         ~(np.abs(values[:, :7]) < MAX_COORDINATE_M),
-        f"a value is not finite, or above {MAX_COORDINATE_M:.0e}",
-        "Remove that line.",
+        f"the line contains a value that is not finite or above {MAX_COORDINATE_M:.0e}",
+        "Remove this line.",
     )
     position = values[:, :3]
     rotation = _read_rotation(rows, values[:, 3:7], is_w_first)
@@ -121,8 +121,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     kind, kind_note = _detect_kind(path, columns, comments, position, rotation)
     frame, frame_note = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
+    clock_text = "UNIX times" if is_unix else "not UNIX times"
     reader_notes = (
-        f"The format is {format_name}; the timestamps are {'' if is_unix else 'not '}UNIX time.",
+        f"The format is {format_name}; the timestamps are {clock_text}.",
         time_note,
         kind_note,
         frame_note,
@@ -169,7 +170,7 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Return the numeric rows, the comments (with header), and a note on an incomplete last row."""
+    """Return the numeric rows, the comments (with header), and a note on a dropped last row."""
     text = decode_text(content)
     if text is None:
         fault, remedy = "a binary file", _REMEDY
@@ -191,7 +192,9 @@ def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     truncation_note = ""
     widths = [len(_fields(line)) for _, line in (*numeric_rows[:1], *numeric_rows[-1:])]
     if not text.endswith("\n") and widths != sorted(widths):
-        truncation_note = f"The incomplete last line ({numeric_rows.pop()[0]}) was dropped."
+        truncation_note = (
+            f"The last line (line {numeric_rows.pop()[0]}) is incomplete and was dropped."
+        )
     if len(numeric_rows) < MIN_POSES:
         raise TrajectoryError(
             f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
@@ -228,16 +231,16 @@ def _detect_quaternion_order(rows: Rows, separator: str | None, comments: str) -
             )
     if is_w_first == (separator is not None):
         return is_w_first, _EUROC if is_w_first else _TUM
-    order = "blanks and quaternion w first" if is_w_first else "commas and quaternion w last"
-    return is_w_first, f"a table with {order}, according to the header"
+    order = "blanks and quaternion order wxyz" if is_w_first else "commas and quaternion order xyzw"
+    return is_w_first, f"a table separated by {order}, according to the header"
 
 
 def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
-    """Convert the timestamps to s; also return a note if the unit may not be seconds."""
+    """Convert the timestamps to seconds; also return a note on the unit, or an empty string."""
     is_invalid = np.array(
         [not is_number(text.strip()) or not np.isfinite(float(text)) for text in timestamps]
     )
-    rows.raise_where(is_invalid, "column 1 is not a time", "Correct or remove that line.")
+    rows.raise_where(is_invalid, "the first column is not a time", "Correct or remove this line.")
     values = np.array(timestamps, dtype=np.float64)
     median_interval = float(np.median(np.abs(np.diff(values))))
     if median_interval <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
@@ -259,7 +262,7 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
             counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
             # Seconds and remainder are divided separately: float64 cannot represent UNIX time in ns
             seconds = counts // units_per_second + counts % units_per_second / units_per_second
-            return seconds, f"The timestamps are {unit} and were divided by {units_per_second:.0e}."
+            return seconds, f"The timestamps were converted from {unit} to seconds."
     raise TrajectoryError(
         f"{rows.file_name}: the median interval of the timestamps, {median_interval:.3g}, is not "
         "valid in any unit from seconds to nanoseconds",
@@ -268,21 +271,25 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
 
 
 def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
-    """Return a mask of the rows without repeated timestamps, and a note on the dropped rows."""
+    """Return a mask of the rows without repeated timestamps, and a note on the other rows."""
     steps = np.diff(time, prepend=-np.inf)
     rows.raise_where(
         steps < 0.0,
         "the timestamp is earlier than in the line above",
-        "Sort the lines by time, or separate the recordings.",
+        "Sort the lines by time, or write each recording to a separate file.",
     )
     repeated_count = int((steps == 0.0).sum())
     if repeated_count > MAX_REPEATED_FRACTION * len(steps):
         rows.raise_where(
             steps == 0.0,
-            f"this timestamp and {repeated_count - 1} others are the same as in the line above",
+            f"this line and {repeated_count - 1} others have the same timestamp as the line above",
             "Export the timestamps with all digits (%.9f).",
         )
-    note = f"Dropped poses with a repeated timestamp: {repeated_count}." if repeated_count else ""
+    note = (
+        f"Number of dropped poses with a repeated timestamp: {repeated_count}."
+        if repeated_count
+        else ""
+    )
     return steps > 0.0, note
 
 
@@ -291,7 +298,7 @@ def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
     rows.raise_where(
         np.abs(norms - 1.0) > MAX_NORM_ERROR,
         "columns 5 to 8 are not a quaternion with norm 1",
-        f"Remove that line, or check the order of the columns. {_REMEDY}",
+        f"Remove this line, or check the order of the columns. {_REMEDY}",
     )
     norms[np.abs(norms - 1.0) < UNIT_NORM_TOLERANCE] = 1.0
     quaternion = np.roll(quaternion, -1, axis=1) if is_w_first else quaternion
@@ -302,15 +309,15 @@ def _detect_kind(
     path: Path, columns: int, comments: str, position: Array, rotation: Rotation
 ) -> tuple[Kind, str]:
     if columns == EUROC_COLUMNS[1]:
-        return "truth", "The kind is ground truth, according to its 17 columns."
+        return "truth", "The trajectory is ground truth, according to the 17 columns of the file."
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
         if _TRUTH_WORDS.search(text):
-            return "truth", f"The kind is ground truth, according to {source}."
+            return "truth", f"The trajectory is ground truth, according to {source}."
     if max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY:
-        return "slam", "The kind is SLAM, because the first pose is the identity."
+        return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
 
 
@@ -325,19 +332,22 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if not is_level or tilt > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
-        "The frame is that of a camera (x right, y down, z forward), because the motion is level "
-        f"and its vertical is {math.degrees(tilt):.0f}° from y."
+        "The frame is a camera frame (x right, y down, z forward), because the motion is in a "
+        f"plane with the normal {math.degrees(tilt):.0f}° from the y axis."
     )
 
 
 def _describe_gaps(time: Array, kind: Kind) -> str:
-    """Return a note on gaps between poses or an irregular pose rate; "" if the rate is regular."""
+    """Return a note on gaps between poses or an irregular pose rate.
+
+    Return an empty string if the pose rate is regular.
+    """
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
     if is_regular.mean() < MIN_REGULAR_FRACTION:
         return (
-            f"The poses are key frames, or many poses are missing: their intervals are irregular "
+            "The poses are key frames, or many poses are missing: the pose intervals are irregular "
             f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."
         )
     gaps = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
@@ -345,8 +355,8 @@ def _describe_gaps(time: Array, kind: Kind) -> str:
         return ""
     lost_s = intervals_s[gaps] - median_s
     longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
+    fault = "Tracking was lost" if kind == "slam" else "Poses are missing"
     return (
-        f"{'Tracking was lost' if kind == 'slam' else 'Poses are missing'} for "
-        f"{lost_s.sum():.1f} s in {len(gaps)} gaps, the longest at {longest_start_s:.1f} s after "
-        "the start."
+        f"{fault} for {lost_s.sum():.1f} s in {len(gaps)} gaps. The longest gap begins "
+        f"{longest_start_s:.1f} s after the first pose."
     )

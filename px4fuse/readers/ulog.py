@@ -25,7 +25,7 @@ from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions,
 from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Minimum interval (s) between IMU samples for a gap in the IMU data: normal intervals are 4 ms
+# Minimum interval (s) between two IMU samples that counts as a gap: normal intervals are 4 ms
 MIN_IMU_GAP_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
@@ -104,7 +104,7 @@ def _describe_damage(topics: Topics, imu: TableOrUnavailable, in_flight: bool) -
 
 
 def _start_unix_s(topics: Topics) -> float | None:
-    """Return the UNIX time (s) at flight time zero: median over the fixes of the GNSS receiver."""
+    """Return the UNIX time (s) at flight time zero: the median over the GNSS fixes."""
     gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
@@ -118,7 +118,10 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples and record their topic; Unavailable with fewer than two samples."""
+    """Return the samples, and record their topic as stream.
+
+    The result is Unavailable if the log contains fewer than two samples.
+    """
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)
@@ -146,7 +149,7 @@ def _read_airborne(topics: Topics) -> Spans | Unavailable:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            f"{px4.DEFAULT_PROFILE} Or give --start and --end.",
+            f"{px4.DEFAULT_PROFILE} Or give the time of the flight with --start and --end.",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)

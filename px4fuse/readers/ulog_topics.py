@@ -38,15 +38,15 @@ _MICROSECOND = 1e-6
 # Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not
 # boot time (GPS topics before v1.16 have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
-# Maximum distance (s) of valid samples from the time span of the IMU data: samples further outside
-# are outdated
+# Maximum distance (s) of valid samples from the time span of the IMU data: samples further away are
+# outdated
 MAX_OUTSIDE_S = 2.0
 # Last byte of ver_sw_release in a PX4 release
 RELEASE_TYPE = 255
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
-# Maximum gap (s) of the IMU timestamps in one flight: samples after a longer gap are from another
-# boot
+# Maximum interval (s) between IMU timestamps of one flight: samples after a longer interval are
+# from another boot
 MAX_DATA_GAP_S = 600.0
 # Maximum number of fields of all subscriptions (300 bytes of memory each); real logs have 3,300
 MAX_FIELDS = 200_000
@@ -73,7 +73,7 @@ _PARSE_ERRORS = (
 # Arrays of one topic instance by PX4 field name, and all topics by name and instance
 Table = dict[str, NDArray[Any]]
 Tables = dict[tuple[str, int], Table]
-# (start time in s, primary EKF2 instance from then on)
+# Start time (s) and number of each primary EKF2 instance
 Instances = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
 NO_SELECTOR: Instances = ((-np.inf, 0),)
@@ -182,10 +182,10 @@ class Topics:
         Boot time (µs) at flight time zero.
     dropped : dict
         Number of samples with an invalid timestamp, by topic and instance; filled by
-        :meth:`frame`.
+        :meth:`read_instance`.
     ekf2_parameters : mapping
-        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters used in
-        results.
+        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters in
+        the results.
     is_cut : bool
         True if the file ends within a message.
     is_damaged : bool
@@ -211,14 +211,14 @@ class Topics:
         return sorted(instance for name, instance in self.tables if name == topic)
 
     def of(self, topic: str) -> list[Table]:
-        """Return the tables of a topic's instances, in order."""
+        """Return the tables of all instances of a topic, in order of the instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
     def primary(self) -> Instances:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
-        instances = instances[instances < 255]  # 255: none selected yet
+        instances = instances[instances < 255]  # 255 means that no instance is selected yet
         if instances.empty:
             return NO_SELECTOR
         changes = instances[instances.ne(instances.shift())]
@@ -228,7 +228,10 @@ class Topics:
         )
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are all in the log; None without one."""
+        """Return the first layout whose required fields are all in the log.
+
+        Return None if there is no such layout.
+        """
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
@@ -283,7 +286,10 @@ class Topics:
         )
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout whose fields are in the log, see :meth:`frame`; else empty."""
+        """Read the first layout whose fields are in the log, see :meth:`read_instance`.
+
+        Return an empty table if there is no such layout.
+        """
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
 
@@ -301,7 +307,7 @@ class Topics:
         Parameters
         ----------
         layout, step
-            See :meth:`frame`.
+            See :meth:`read_instance`.
         select : callable, optional
             Filter for the rows of each instance; by default all rows are used.
         """
@@ -328,10 +334,9 @@ class Topics:
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
+        event = "measurement" if has_measurement_time else "publication"
         self.streams[data_kind] = Stream(
-            topics,
-            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}",
-            self.log.name,
+            topics, f"autopilot boot clock, time of {event}", self.log.name
         )
 
 
@@ -344,10 +349,10 @@ def _empty_frame(layout: Layout) -> pd.DataFrame:
 
 
 def measurement_time_us(table: Table) -> NDArray[np.int64]:
-    """Return the measurement time (µs): ``timestamp_sample`` if it is boot time.
+    """Return the measurement time since boot (µs) of each row: ``timestamp_sample``.
 
-    Otherwise the publication time ``timestamp`` is returned, which is up to 0.2 s later in EKF2
-    topics.
+    If ``timestamp_sample`` is not boot time, return the publication time ``timestamp``, which is up
+    to 0.2 s later in EKF2 topics.
     """
     published_us = table["timestamp"].astype(np.int64)
     sampled_us = table.get("timestamp_sample")
@@ -392,7 +397,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
 def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
     """Format the notes on samples that were dropped because of invalid timestamps."""
     return tuple(
-        f"samples of {topic} dropped because of an invalid timestamp: {count}"
+        f"number of samples of {topic} dropped because of an invalid timestamp: {count}"
         for topic, count in topic_counts
     )
 
@@ -408,7 +413,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     source = _Content(content)
     size = len(content)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
+        with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _Reader(source, message_name_filter_list=topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
@@ -513,7 +518,10 @@ def _read_parameters(
 
 
 def _read_tables(ulog: ULog) -> Tables:
-    """Return the topic tables; two subscriptions to a topic are merged to their common fields."""
+    """Return the topic tables.
+
+    Two subscriptions to one topic are merged to the fields that both have.
+    """
     tables: Tables = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
@@ -534,7 +542,7 @@ def _read_tables(ulog: ULog) -> Tables:
 
 
 def _data_span(tables: Tables, name: str) -> tuple[int, int]:
-    """Return the first and last time (µs) of the IMU, or else of the topic with most samples."""
+    """Return first and last time (µs) of the IMU data, or else of the topic with most samples."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
     ):
@@ -547,7 +555,7 @@ def _data_span(tables: Tables, name: str) -> tuple[int, int]:
             return int(longest_us[0]), int(longest_us[-1])
     raise LogError(
         f"{name}: all timestamps are zero",
-        "Record again.",
+        "Record the flight again.",
     )
 
 

@@ -96,7 +96,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
     axis : str
         Direction of the errors with its reference.
     name : str
-        Name of the axis, for the scripts of pages with several axes.
+        Name of the axis, by which scripts find the figure on pages with several axes.
     """
     return load_template("report/card_axis.html").render(
         verdicts=all_verdicts,

@@ -32,7 +32,7 @@ from px4fuse.request import quote_command
 CARD_WIDTH = 100
 AXIS_WIDTH = 37
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
-TEXT_INDENT = 11  # number of characters left of a text with a label
+TEXT_INDENT = 11  # number of characters left of a text beside a label
 # Maximum length of a command on the line of its label; longer commands have their own line
 MAX_COMMAND_LENGTH = 74
 # Ticks of the axis of σ ratios that have a label
@@ -98,7 +98,7 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
             yield from _labelled_lines(label, text)
-        yield Line("Nothing was written. Exit code 2.")
+        yield Line("No file was written. Exit code 2.")
         return
     yield from _identity_line(card)
     yield from _headline_lines(card)
@@ -306,8 +306,8 @@ def rerun_start(reruns: Sequence[Rerun]) -> str:
     if not starts:
         return ""
     return (
-        f"EKF2 (replay) is a prediction. Both values are from the replay after {min(starts):.0f} "
-        "s, without gaps."
+        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values are from the time "
+        f"after {min(starts):.0f} s without gaps."
     )
 
 
@@ -339,7 +339,9 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line("  A verdict in brackets is explained below and is not a fault of the filter.")
+        yield Line(
+            "  The causes below explain verdicts in brackets, which are not faults of the filter."
+        )
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 

@@ -14,11 +14,11 @@ from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, LINES, Axes
 from px4fuse.results.contract import ComparisonResults
 
-CURVE_HEIGHT = 170.0  # height (points) of the axes
+CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
 MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
 # Maximum distance of a drawn time offset from the estimate, in half widths of its 95 % interval
 CURVE_HALF_WIDTH = 2.5
-# Ids of findings on the time offset; with one of them the report has this page
+# Ids of the findings for which the report has an appendix on the time offset
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
@@ -39,13 +39,13 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """Return the time offset of the position source, and the actions against it, by label."""
+    """Return sentences on the time offset of the position source and its correction, by label."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:
         return {
             "Offset": f"The time offset cannot be estimated: {clock.reason}.",
-            "Action": "Fly passes of 5 m or more with clear starts and stops.",
+            "Action": "Fly passes of 5 m or more, and stop after each pass.",
         }
     offset, (low, high) = clock.offset_s, clock.interval_s
     advice = {
@@ -69,7 +69,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     if drift := find_faults(comparison.convention, comparison.flight, source.frame).clock_drift:
         advice["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * drift):.1f} % "
-            f"{'fast' if drift > 0.0 else 'slow'}. The offset is that of the middle of the data."
+            f"{'fast' if drift > 0.0 else 'slow'}. The offset applies to the middle of the data."
         )
     elif clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * clock.drift_sigma_ppm

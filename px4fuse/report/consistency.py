@@ -43,7 +43,7 @@ MAX_NORMALISED = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
 # Maximum of the density axis, so that the normal density (maximum 0.4) remains visible
 MAX_DENSITY = 1.6
-# Maximum p value of the Ljung-Box test for innovations that are not white
+# Maximum p value of the Ljung-Box test at which innovations are called "not white"
 MAX_NON_WHITE_P = 0.01
 RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation

@@ -1,6 +1,6 @@
 """Plots of the cover: map, position errors of KF and EKF2, normalised innovations.
 
-Values outside of a plot over time are drawn as triangles at its edge.
+Values outside a plot over time are drawn as triangles at the edge of the plot.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum length / width of a track for plots that fill the page width
+# Minimum ratio of length to width of a track, for plots that fill the page width
 MIN_LONG_RATIO = 2.2
-# Limits (points) of the height of the map, with title and labels
+# Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Minimum height (points) of all plots; with less height, the plots are on the next page
+# Minimum height (points) below the card for the plots; with less, they are on the next page
 MIN_HEIGHT = 38.0 * POINTS_PER_MM
-# Minimum height (points) of all plots for a plot of the innovations
+# Minimum height (points) below the card for a plot of the innovations too
 MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
-# Limits (points) of the height of the innovation plot, with title and labels
+# Minimum and maximum height (points) of the innovation plot, with title and labels
 INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
 MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
-# Total height (points) of the plots on the next page
+# Total height (points) of the plots if they are on the page after the card
 NEXT_PAGE_HEIGHT = 160.0 * POINTS_PER_MM
 TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
 TITLE_LINE = 10.5  # height (points) of each further line of a title
-# Height (points) above the legend and below the last plot
+# Unused height (points): gap above the legend, and gap below the last plot
 UNUSED_HEIGHT = 15.0
 # Minimum height (points) of the innovation plot for ticks at ±2 in addition to -4, 0 and 4
 MIN_TICKS_HEIGHT = 48.0
@@ -66,14 +66,14 @@ MAP_FRACTION = 0.25
 MAX_NORMALISED = 4.0
 # Height (points) below the axes, without and with labels of the time axis
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
-# Ratio of the map's length to the length of the tracks
+# Ratio of the length of the map to the length of the tracks
 MAP_MARGIN = 1.08
-# Maximum distance of a drawn track from the positions, as a fraction of their extent
+# Maximum distance of the map's edge from the positions, as a fraction of their extent
 MAP_REACH = 0.25
 MIN_MAP_LENGTH_M = 0.5
-# Maximum ratio of the largest to the smallest σ for a title with one value of σ
+# Maximum ratio of the largest to the smallest σ, for a title that states the median σ only
 MAX_SIGMA_RATIO = 1.5
-# Time (s) in which σ settles at the start; titles do not include its values
+# Time (s) in which σ decreases at the start of the filter; not included in σ of titles
 SETTLING_S = 2.0
 Coordinates = tuple[Array, Array]
 
@@ -88,7 +88,7 @@ class TimePlot(NamedTuple):
 class FlightMap(NamedTuple):
     """Tracks seen from above, in metres to the right and upwards, with the axis labels.
 
-    Of ``right_labels`` the first that fits is used.
+    The map uses the first of ``right_labels`` that fits its width.
     """
 
     tracks: Mapping[str, Coordinates]
@@ -267,7 +267,7 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
     """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
     series = normalised_innovations(result)
     symbols = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
-    title = f"Innovations ÷ √S ({symbols}): 95 % belong inside ±2"
+    title = f"Innovations ÷ √S ({symbols}): 95 % expected within ±2"
     beyond = [
         f"{name} {format_ratio(size)}"
         for name, values in series.items()
@@ -339,7 +339,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     }
     outside = [f"{name} {format_metres(d)} m" for name, d in distances_m.items() if d > 0.0]
     if outside:
-        title = f"Map; tracks leave it by up to: {', '.join(outside)}"
+        title = f"Map; largest distance outside the map: {', '.join(outside)}"
         axes_height = height - _head_height(page, title) - HEIGHT_BELOW_AXES[True]
         limits = _map_limits(tracks, width / axes_height)
     axes = page.panel(title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
@@ -371,7 +371,7 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> tuple[Array,
     """Return the lower left and the upper right corner of the map (m).
 
     The map shows all ground truth and 98 % of the positions, and the other tracks up to
-    :data:`MAP_REACH` outside of these, so a filter with a large error does not shrink the flight.
+    :data:`MAP_REACH` outside of these, so a large error of a filter does not reduce the scale.
     """
     middles, sizes = [], []
     for side in (0, 1):

@@ -37,7 +37,7 @@ INCREASE_STYLE = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if they are unknown."""
+    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if none is known."""
     explanations = _axis_explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
@@ -58,9 +58,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         else:
             _draw_axis(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
-    assert isinstance(
-        replay, Ekf2Replay
-    )  # without a replay of EKF2 the difference is not explained
+    assert isinstance(replay, Ekf2Replay)  # explanations of the difference need a replay
     assert replay.agreement is not None
     page.write_small(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
@@ -111,7 +109,7 @@ def format_agreement(agreement: Agreement) -> str:
         f"{ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
         f"{agreement.rejected_fraction_logged:.1%})"
         + "".join(
-            f". The {AIDS[name].label} does not agree and is not used: {reason}"
+            f". The replay of {AIDS[name].label} does not agree and is not used: {reason}"
             for name, reason in agreement.doubtful.items()
         )
     )
@@ -145,7 +143,7 @@ def _draw_axis(
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained_mean_square / total)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    title = "Position difference KF - EKF2 (m, dark) and unexplained rest (light)"
+    title = "Position difference KF - EKF2 (m, dark) and unexplained difference (light)"
     axes = event_marks.panel(
         page,
         analysis,
@@ -189,7 +187,7 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
 def _time_sentence(explanation: DifferenceExplanation) -> str:
     largest_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
-        f"Largest difference {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
+        f"Largest difference KF - EKF2: {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
         f"{explanation.times_s[largest_row]:.1f} s; unexplained RMS "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

@@ -24,9 +24,9 @@ MAP_AXES: Mapping[Frame, tuple[int, int]] = {
     "camera": (0, 2),
     "unknown": (0, 1),
 }
-# Minimum time between two poses for a gap in the drawn path, in median times between poses
+# Minimum interval between two poses that is drawn as a gap, relative to the median interval
 MIN_GAP_STEPS = 10.0
-MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
+MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
@@ -36,7 +36,7 @@ STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
 )
-NEGLIGIBLE_ERROR_M = 1e-6  # maximum error (m) by rounding
+NEGLIGIBLE_ERROR_M = 1e-6  # maximum position error (m) that rounding can cause
 ERROR_TABLE_HEAD = (
     "error",
     "RMSE",
@@ -101,7 +101,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
         path[::stride, 1],
         c=error[::stride],
         s=9.0,
-        cmap="copper_r",  # from light to dark, readable in grey and on white
+        cmap="copper_r",  # colours from light to dark, which differ in greyscale too
         linewidths=0,
         vmin=0.0,
         vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
@@ -206,8 +206,8 @@ def summary(evaluation: Evaluation) -> str:
     return (
         f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
         f"{format_metres(error.max)} m at "
-        f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after "
-        f"{evaluation.distance_m[worst_index]:.1f} m of the path."
+        f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after a path of "
+        f"{evaluation.distance_m[worst_index]:.1f} m."
     )
 
 
@@ -269,7 +269,7 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
     return (
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
         f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
-        f"{scale_text} (choice of frame, not an error)."
+        f"{scale_text} (difference of the frames, not an error)."
     )
 
 

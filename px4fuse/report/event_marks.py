@@ -18,7 +18,7 @@ from px4fuse.report.style import (
     label_time_axis,
 )
 
-# Bands differ in shade and hatching, so they remain distinct in grey
+# Bands differ in shade and hatching, so they remain distinct in greyscale
 _FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
 GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
     {"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8", "#f6f0e2")
@@ -34,7 +34,7 @@ MODE_LETTER_WIDTH = 5.0  # mean width (points) of a letter of a flight mode's na
 
 
 class Mark(NamedTuple):
-    """Events of one type on a time axis: bands without `height`, else markers at 0 to 1."""
+    """Events of one type on a time axis: markers at `height` (0 to 1), else bands."""
 
     label: str
     spans_or_times: Sequence[Any] | Array

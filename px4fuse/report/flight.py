@@ -21,8 +21,8 @@ from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATES = 15  # number of updates in the plot of single predictions and updates
-MIN_ZOOM_S = 1.0  # minimum duration (s) of that plot
-ZOOM_HEIGHT = 125.0  # height (points) of its axes
+MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of single predictions and updates
+ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of single predictions and updates
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -126,7 +126,7 @@ def zoom_sentence(result: AxisComparison) -> str:
         if prior_m is None or posterior_m is None:
             if name == "EKF2":
                 texts.append(
-                    "σ of EKF2 before and after the update is unknown, because S or R is not logged"
+                    "σ of EKF2 before and after an update is unknown: S or R is not logged"
                 )
             continue
         reduction = 1.0 - posterior_m**2 / prior_m**2

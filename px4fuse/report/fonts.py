@@ -9,12 +9,12 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-# Installed with matplotlib; has Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
+# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 # Words in the names of fonts that draw a box for every character
 BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MAX_LISTED_CHARACTERS = 12  # maximum number of missing characters in the advice
+MAX_LISTED_CHARACTERS = 12
 
 
 @cache

@@ -30,7 +30,7 @@ LEAD = (
     "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
     "tested first, because a false closure would deform the whole path."
 )
-MAX_LISTED_CLOSURES = 10  # maximum number of rejected closures that the terminal lists
+MAX_LISTED_CLOSURES = 10
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
     corrections.UNCORRECTED: LINES["EKF2"],
@@ -81,12 +81,12 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
     _draw_map(page, loop)
-    page.heading("Closures and scores")
+    page.heading("Loop closures and scores")
     page.write(
         (
             "d²: squared Mahalanobis distance of the closure given drift and closure "
             "noise. p: probability of a larger d² for a true closure. GNC weight: "
-            "1 keeps the closure, 0 drops it."
+            "1 if the closure is used, 0 if it is excluded."
         ),
         colour=MUTED_COLOUR,
     )
@@ -193,8 +193,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         )
         if names
         else (
-            "No ground truth and no reference trajectory, so the error of the path is "
-            "unknown. Add a reference trajectory with --reference FILE."
+            "The error of the path is unknown without ground truth or reference "
+            "trajectory. Add a reference trajectory with --reference FILE."
         )
     )
 
@@ -267,7 +267,7 @@ def describe_closure_error(loop: Loop) -> str:
     """Format the closure error in m, in percent of the path length, and its heading error."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
-        return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
+        return f"none: the path of {loop.path_length_m:.1f} m does not return to its start (--open)"
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "
         f"{format_vector(misclosure)}"
@@ -280,10 +280,10 @@ def describe_closure_error(loop: Loop) -> str:
 
 def describe_gate(closure: Closure) -> str:
     """Format the chi-square test of a loop closure."""
-    verdict = "accepted: consistent" if closure.accepted else "REJECTED: not consistent"
+    verdict = "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}); {verdict} with the stated drift"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
     )
 
 
@@ -300,11 +300,9 @@ def by_distance_sentence(loop: Loop) -> str:
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = (
-        "The correction with headings also rotates each motion by a part of the heading error."
-    )
+    headings = "The correction with headings also distributes the heading error along the path."
     if isinstance(heading_deg, Unavailable):
-        headings = f"The correction of headings is missing: {heading_deg.reason}."
+        headings = f"The headings are not corrected: {heading_deg.reason}."
     return (
         "The correction by distance shifts each position by a part of the closure error that is "
         "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
@@ -339,7 +337,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def format_correction(correction: CorrectedPath) -> str:
-    """Format RMS and maximum (m) by which a correction moves the path."""
+    """Format RMS and maximum (m) of the position change by a correction."""
     if not correction.correction_max_m:
         return "–"
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
@@ -365,12 +363,14 @@ def graph_summary(solved_graph: Graph) -> Page:
         lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected_gates]
         listed_closures = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
         page.write_labelled(
-            "Gate", f"{len(rejected_gates)} of {len(gates)} closures rejected", *listed_closures
+            "Gate",
+            f"{len(rejected_gates)} of {len(gates)} loop closures rejected",
+            *listed_closures,
         )
         if len(gates) > MAX_ROBUST_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(
                 "Robust",
-                "the robust solution is missing, because the graph has many closures; add --robust",
+                "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
     unconverged = [
         SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged

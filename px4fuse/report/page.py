@@ -144,7 +144,7 @@ class Page:
         is_compact : bool
             Small title and gaps, for the cover.
         """
-        # imported here because matplotlib takes 0.3 s, which text-only commands save
+        # imported here, because text-only commands do not need matplotlib (0.3 s)
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
@@ -208,13 +208,13 @@ class Page:
         )
 
     def add_columns(self, *columns: Page, above: float = 6.0) -> None:
-        """Add columns side by side, with a space `above` them in points."""
+        """Add columns side by side, below a gap of `above` points."""
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
 
 
 def halves(left_fraction: float = 0.5) -> tuple[Page, Page]:
-    """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
+    """Return two columns that fill the page; the left one has `left_fraction` of the width."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
@@ -229,7 +229,7 @@ def text_width(text: str) -> float:
     from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
-    # measured at a large size, because widths at a small one are rounded to whole points
+    # measured at a large font size, because widths are rounded to whole points
     font.set_size(100.0, 72.0)
     font.set_text(text, 0.0)
     return float(font.get_width_height()[0]) / 64.0 * 0.08

@@ -27,9 +27,9 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Ratio of the half height of the innovation plot to the larger of 2√S and the 99 % quantile of |ν|
+# Half height of the innovation plot divided by the larger of 2√S and the 99 % quantile of |ν|
 EDGE_FACTOR = 1.3
-# Maximum 99 % quantile of |ν|, in √S, that enlarges the innovation plot
+# Upper limit of the 99 % quantile of |ν|, in √S, for the height of the innovation plot
 MAX_EDGE_SIGMAS = 5.0
 
 
@@ -77,9 +77,9 @@ class Panel(NamedTuple):
         with_time_label : bool
             Label the time axis, which all panels above share.
         with_mode_names : bool
-            Write the names of the flight modes above it.
+            Write the names of the flight modes above the plot.
         is_narrow : bool
-            Draw it in a narrow column: without caption, and with the numbers below it.
+            Draw the plot in a narrow column: without caption, with the numbers below the plot.
         """
         title, caption, height, numbers = self.title, "", NARROW_HEIGHT, self.numbers(result)
         if not is_narrow:
@@ -176,15 +176,15 @@ def _velocity_numbers(result: AxisComparison) -> str:
 
 def _axis_half_height(result: AxisComparison) -> float:
     """Return the half height (m) of the plot of innovations, which outliers do not enlarge."""
-    limits = []
+    half_heights_m = []
     for innovations in (result.replay.updates, result.ekf2_innovations):
         if isinstance(innovations, pd.DataFrame):
             median_sigma = float(np.sqrt(innovations["innovation_variance_m2"].median()))
             usual_innovation = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-            limits.append(
+            half_heights_m.append(
                 max(2.0 * median_sigma, min(usual_innovation, MAX_EDGE_SIGMAS * median_sigma))
             )
-    return EDGE_FACTOR * max(limits)
+    return EDGE_FACTOR * max(half_heights_m)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
@@ -211,7 +211,7 @@ def draw_dots(
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
-    """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
+    """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
     half_height, ekf2_innovations = _axis_half_height(result), result.ekf2_innovations
     updates = result.replay.updates
     kf_innovations = updates["innovation_m"]
@@ -245,7 +245,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
         table = innovation_tables[name]
         assert isinstance(table, pd.DataFrame)  # filters with a verdict have innovations
         outside_count = int((table["innovation_m"].abs() > half_height).sum())
-        outside = f", {outside_count} outside the plot (triangles)" if outside_count else ""
+        outside = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
@@ -292,7 +292,7 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     growth = " and ".join(
         f"{sigma:.2g} m ({name})" for name, sigma in largest_sigmas.items() if np.isfinite(sigma)
     )
-    return growth and f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
+    return growth and f"In the gap of {end - start:.1f} s from {start:.0f} s, σ grew to {growth}."
 
 
 def _median_text(result: AxisComparison, quantity: Quantity) -> str:

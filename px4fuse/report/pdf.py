@@ -95,7 +95,7 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = student_line(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
-    # figures contain no names and notes, so they need no further fonts
+    # figures need no further fonts, because they contain no names or notes
     all_text = title + name + student + written_text
     return compile_pdf(
         {

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Maximum p value of the Ljung-Box test for a note that innovations are not white: with eight tests
 # per flight, less than 1 % of flights have a false alarm
 MIN_WHITE_P = 0.001
-# Words for each verdict: "the reported σ is ..."
+# Size of the reported σ for each verdict
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
 RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -149,7 +149,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     notes = []
     if comparison.source.origin.may_drift:
         notes.append(
-            "The source may drift. The verdicts compare each filter with the source, "
+            "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
     correlated = [
@@ -207,16 +207,16 @@ def tuning_advice(
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
-    name = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
-    tuning = tuning_by_axis.get(name)
+    axis = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
+    tuning = tuning_by_axis.get(axis)
     if not isinstance(tuning, AxisTuning):
         return {}
     advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
-            "The source may drift. These noises describe its short-term noise, not its "
-            "error. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
+            "The position source may drift. The estimates describe the noise without the "
+            "drift. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
             "ground truth or a loop."
         )
     options = [
@@ -226,7 +226,7 @@ def tuning_advice(
     ]
     if options:
         command = f"px4fuse compare LOG{''.join(options)}"
-        advice["Action"] = f"Re-run with the estimates of {name}: {command}"
+        advice["Action"] = f"Re-run with the estimates of {axis}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m. Check that the source measures positions."
@@ -258,12 +258,12 @@ def tuning_advice(
         bound = "" if tuning.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
             f"Accelerometer noise alone is {bound}{accelerometer_noise:.2g} m/s². KF has no state "
-            "for accelerometer bias and tilt error. To cover them SIGMA_A must be "
+            "for accelerometer bias and tilt error. To include both, SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
     if len(tuning.outlier_time_s):
         advice["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({name}) are outliers, "
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis}) are outliers, "
             f"the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude them."
         )
     return advice

@@ -60,7 +60,7 @@ def _findings_page(results: ComparisonResults | AidsResults) -> Page:
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
     """Write log, position source and parameters.
 
-    Names and SHA-256 of the files are last, so that they stand on the last page.
+    Names and SHA-256 of the files are last, so that they are on the last page.
     """
     log, facts = flight.log, dict[str, str]()
     other_positions = (
@@ -84,7 +84,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
     }
     section = Page()
     _write_section(section, "Log", facts.items())
-    page.add_columns(section)  # Typst does not divide one column
+    page.add_columns(section)  # Typst does not split a column between pages
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:

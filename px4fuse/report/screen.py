@@ -31,7 +31,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Encodings of terminals that can print all characters of a card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Function that yields the lines of a card, by kind of block
+# Function that yields lines of a card, by kind of block on the page
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
 INDENT = 9  # number of characters of a label
 COLUMN_POINTS = 6.0  # indent in the PDF (points) for one character on the terminal

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-else:  # importing matplotlib takes 0.3 s, which text-only commands save
+else:  # text-only commands do not import matplotlib (0.3 s)
     Artist = Axes = Any
 __all__ = ["Artist", "Axes"]  # matplotlib types for annotations
 
@@ -84,7 +84,7 @@ def report_style() -> Iterator[None]:
 
 
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
-    """Draw a time series, reduced to the number of points that the axes can show."""
+    """Draw a time series, reduced to MAX_POINTS or, in narrow axes, MAX_POINTS_NARROW points."""
     axes.plot(
         *decimate_series(
             values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)

@@ -53,7 +53,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
-    """Format the statistics of EKF2, by label. ``replayed`` decides on heading and height."""
+    """Format the statistics of EKF2, by label; heading and height only if ``replayed`` has them."""
     texts = dict[str, str]()
     for name, axis in summary.axes.items():
         texts |= _nis_texts(name, axis) | {
@@ -153,7 +153,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
             f"be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would change "
             f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. The "
-            "result then depends on single rejections."
+            "statistics then depend on the rejection of single samples."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 
@@ -170,7 +170,7 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
-    page.write_labelled("Used", f"All columns are evaluated from {spans} of the flight.")
+    page.write_labelled("Used", f"All columns are evaluated over the time {spans}.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]
     page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))

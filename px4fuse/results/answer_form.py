@@ -66,7 +66,7 @@ VERDICTS = ("consistent", "overconfident", "underconfident")
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
-# Answer to a question about a number: the number, a list of update numbers, or None (left blank)
+# Answer to a question about a number: the number, a list of update numbers, or None (no answer)
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
@@ -145,7 +145,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Quantities that the questions of a form can request: one of each pair is drawn at random
+# Pairs of quantities for the questions of a form: one of each pair is drawn at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -227,7 +227,7 @@ def read_answers(path: Path) -> Answers:
         answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct the form with the answers.") from error
+        raise SettingsError(f"{path}: {error}", "Correct the answer form.") from error
     return answers
 
 
@@ -237,7 +237,9 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
     if unknown_fields := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
-        raise ValueError(f"the field {unknown_fields[0]} is not one of mistake, {', '.join(names)}")
+        raise ValueError(
+            f"the field {unknown_fields[0]} is unknown; known fields: mistake, {', '.join(names)}"
+        )
     return {
         **filled_form,
         "mistakes": mistakes,
@@ -270,9 +272,11 @@ def check_answers(answers: Answers) -> None:
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)
         if kinds.count(kind) > 1:
-            raise ValueError(f"kind {kind!r} is given twice; give each kind of mistake once")
+            raise ValueError(
+                f"the form names the kind {kind!r} twice; name each kind of fault once"
+            )
     if NO_MISTAKE_KIND in kinds and len(kinds) > 1:
-        raise ValueError('kind "none" is given together with a mistake; give only one of them')
+        raise ValueError('the form names "none" and a fault; name only one of them')
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for student_mistake in answers.mistakes:
@@ -297,9 +301,8 @@ def check_answers(answers: Answers) -> None:
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
     if value not in choices:
-        allowed = _join_quoted(choices)
-        reason = f"is not one of {allowed}" if allowed else "is not allowed: leave this field empty"
-        raise ValueError(f"{field} {value!r} {reason}")
+        allowed = _join_quoted(choices) or "an empty field"
+        raise ValueError(f"{field} {value!r} is not one of {allowed}")
 
 
 def form_name(log_name: str) -> str:

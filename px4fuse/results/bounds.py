@@ -1,4 +1,4 @@
-"""Bounds of the numbers in results: a number outside its bounds is replaced by the reason.
+"""Bounds of the numbers in results: a number outside its bounds is replaced by a reason.
 
 The bounds depend on the name of a field, which contains quantity and unit.
 """
@@ -16,7 +16,7 @@ from msgspec.structs import fields, replace
 from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
 
-# Maximum absolute length (m), and ratio of two quantities, in results of a flight
+# Maximum absolute value of a length (m), and of a ratio, in the results of a flight
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
 # Minimum and maximum of a number by pattern of its field name; the first match applies
 BOUNDS = {
@@ -45,7 +45,7 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their bounds from results; without such numbers, return the argument.
+    """Remove numbers outside their bounds from results; results without them are not changed.
 
     An optional number is omitted. If a required number is outside its bounds, its record is omitted
     or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes`` of the results.
@@ -134,7 +134,7 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # an error in a tuple of numbers (a vector) is raised, so that the whole vector is omitted
+    # one number outside its bounds omits the whole tuple of numbers (a vector)
     checked = []
     for element in value:
         try:

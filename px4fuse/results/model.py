@@ -10,7 +10,7 @@ from msgspec import Meta
 from px4fuse.core.record import Record
 from px4fuse.results.answer_form import Answers
 
-# Version of the results schema: a new field increases the minor version, another change the major
+# Version of the results schema: new fields increase the minor version, other changes the major
 SCHEMA_VERSION = "4.0"
 # Libraries that affect the numbers in the results
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")

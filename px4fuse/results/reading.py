@@ -48,10 +48,9 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = value.get("provenance")
         writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that wrote it"
+        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the version that wrote it"
         raise ResultsError(
-            f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads version "
-            f"{major}.",
+            f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with {reader}.",
         )
     if int(version.partition(".")[2]) > int(minor):
@@ -84,9 +83,9 @@ def _known_fields(value: Any, kind: Any) -> Any:
 
 
 def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
-    # for a repeated key, other programs may read another value
+    # programs may read different values of a repeated key
     if len(dict(pairs)) < len(pairs):
-        raise ValueError("a key is repeated")
+        raise ValueError("a JSON key is repeated")
 
 
 def _clean_values(value: Any) -> Any:
@@ -96,5 +95,5 @@ def _clean_values(value: Any) -> Any:
     if isinstance(value, dict):
         return {clean_text(key): _clean_values(child) for key, child in value.items()}
     if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
-        raise ValueError("an integer is too large")
+        raise ValueError("an integer has more than 64 bits")
     return list(map(_clean_values, value)) if isinstance(value, list) else value

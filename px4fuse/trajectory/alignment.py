@@ -87,7 +87,7 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
             f"{len(estimate_m)} poses match in time; an alignment needs at least {MIN_POSES}",
-            "Check that both are of the same flight, or give `time_offset_s` auto.",
+            "Check that both trajectories are of the same flight, or give `time_offset_s` auto.",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -129,7 +129,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform with given rotation and scale that aligns the means (eq. 41)."""
+    """Return the transform with this rotation and scale that aligns the means (eq. 41)."""
     shift = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
     return Transform((w, x, y, z), tuple(shift.tolist()), scale, degrees_of_freedom)
@@ -163,17 +163,17 @@ def _require_determined(
         residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
         length = float(np.linalg.norm(reference_extents))
         limit = MAX_PLANE_RATIO
-        motion_text = "horizontal motion (RMS) is"
+        motion_text = "horizontal motion"
         alternative = "`alignment` none"
     else:
         length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
-        motion_text = f"motion is along a line: {length:.2g} m (RMS), across it"
+        motion_text = "motion is along a line: the motion across the line"
         alternative = "`alignment` yaw or none"
     if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
-            f"the alignment {kind} cannot be estimated: the {motion_text} {extent_m:.2g} m, and "
-            f"the residual is {residual_m:.2g} m",
+            f"the alignment {kind} cannot be estimated: the {motion_text} is {extent_m:.2g} m "
+            f"(RMS), and the residual after alignment is {residual_m:.2g} m",
             f"Use {alternative}.",
         )

@@ -13,9 +13,9 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the longest interpolated interval of the reference, in median intervals
+# Default of the longest interval of the reference that is interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum (s) of the default of the longest interpolated interval
+# Minimum default (s) of the longest interpolated interval of the reference
 MIN_GAP_LIMIT_S = 0.1
 # Maximum time difference (s) of two poses that are paired: default of the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
@@ -92,12 +92,12 @@ def associate(
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
-        offset_text = f" (with the time offset {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
-            f"{estimate.name}: {len(pose_indices)} poses match in time. The estimate is from "
-            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{offset_text}, the reference {reference.name} "
-            f"from {first_s:.3f} to {last_s:.3f} s.",
-            "Check that both are of the same flight. If clocks differ, give `time_offset_s` auto.",
+            f"{estimate.name}: {len(pose_indices)} poses match in time. With the time offset "
+            f"{time_offset_s:.12g} s, the estimate is from {time_s[0]:.3f} to {time_s[-1]:.3f} s; "
+            f"the reference {reference.name} is from {first_s:.3f} to {last_s:.3f} s.",
+            "Check that both trajectories are of the same flight. If clocks differ, give "
+            "`time_offset_s` auto.",
         )
     outside = int(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()

@@ -16,7 +16,6 @@ from msgspec import structs
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import OrUnavailable, Record
-from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
@@ -36,9 +35,10 @@ from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimat
 MAX_SCALE_ERROR = 0.1
 # Minimum fraction of used poses, and of covered time of the reference, without a warning
 MIN_COVERAGE = 0.5
-# Minimum estimated time offset (s) for a warning: the lag of a filter is smaller
+# Minimum estimated time offset (s) for a warning that the clocks differ: the lag of a filter is
+# smaller
 MIN_DOUBTFUL_OFFSET_S = 0.1
-# Maximum ratio of the pose intervals, reference to estimate: with a larger ratio, reference and
+# Maximum ratio of the pose intervals of reference and estimate: with a larger ratio, reference and
 # estimate are probably interchanged
 MAX_INTERVAL_RATIO = 5.0
 
@@ -166,7 +166,7 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
-    reason, is_requested = "The alignment is as requested.", alignment is not None
+    reason, is_requested = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, reason = choose_alignment(matched_estimate, matched_reference)
     transform, line_warnings = _fit_or_approximate(
@@ -230,7 +230,11 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
+    """Choose the alignment by the kinds of the trajectories.
+
+    Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
+    is aligned in rotation and position, and in scale if it is monocular or the scale factor error
+    exceeds 10 %. The reason for the choice is returned as a sentence.
 
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
@@ -243,7 +247,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
-        return "none", "Without alignment, because the estimate is ground truth."
+        return "none", "The estimate is not aligned, because the estimate is ground truth."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
@@ -254,8 +258,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     ]
     if is_upright and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
         return "yaw", (
-            f"Yaw and position (4 degrees of freedom): z is vertical in both frames ({frames}), "
-            "so a tilt counts as error."
+            f"Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
+            f"({frames}), so a tilt is an error."
         )
     scale = 1.0
     try:
@@ -263,27 +267,31 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if is_upright:
             return "yaw", (
-                "Yaw and position (4 degrees of freedom): the motion is along a line, and z is "
-                f"vertical in both frames ({frames})."
+                "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
+                f"and z is vertical in both frames ({frames})."
             )
     frame_reason = f"the frames {frames} have no common vertical direction"
     if tracks_without_vertical:
-        is_slam = tracks_without_vertical[0].kind == "slam"
-        frame_reason = f"{tracks_without_vertical[0].name} has an unknown vertical direction " + (
-            "(SLAM in the frame of the first key frame)" if is_slam else "(kind unknown)"
+        track = tracks_without_vertical[0]
+        is_slam = track.kind == "slam"
+        cause = (
+            "SLAM uses the frame of the first key frame"
+            if is_slam
+            else "the trajectory kind is unknown"
         )
+        frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
     monocular = [
         track.name for track in (estimate, reference) if _MONOCULAR_NAME.search(track.name)
     ]
-    scale_reasons = [f"{name} is monocular according to the name" for name in monocular]
+    scale_reasons = [f"{name} is monocular according to the file name" for name in monocular]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reasons.append(
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
         )
     if not tracks_without_vertical or not scale_reasons:
-        return "se3", f"Rotation and position (6 degrees of freedom): {frame_reason}."
+        return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
     return "sim3", (
-        f"Rotation, position and scale (7 degrees of freedom): {frame_reason}, and "
+        f"Rotation, position and scale are aligned (7 degrees of freedom): {frame_reason}, and "
         f"{scale_reasons[0]}."
     )
 
@@ -291,17 +299,17 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
-    """Choose the offset to add to the timestamps of the estimate; return also warnings."""
+    """Choose the offset to add to the timestamps of the estimate; also return warnings."""
     if isinstance(given_s, float | int):
         return TimeOffset(
-            offset_s=given_s, is_determinable=True, reason="The time offset is as requested."
+            offset_s=given_s, is_determinable=True, reason="The user chose the time offset."
         ), []
     clock_offset_s = clock_difference(estimate, reference)
-    clock_text = "UNIX time of both clocks" if clock_offset_s else "unchanged timestamps"
+    clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
     clock_offset = TimeOffset(
         offset_s=clock_offset_s or 0.0,
         is_determinable=True,
-        reason=f"{capitalise_first(clock_text)}.",
+        reason=f"px4fuse uses {clock_text}.",
     )
     start_s, end_s = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
@@ -320,7 +328,7 @@ def _choose_time_offset(
     is_doubtful = not low_s <= 0.0 <= high_s and abs(offset_s) >= MIN_DOUBTFUL_OFFSET_S
     warning = (
         f"The timestamps are unchanged, but the motions match best with {offset_s:+.3f} s added "
-        "to the estimate. For unrelated clocks, give --time-offset auto."
+        "to the timestamps of the estimate. For unrelated clocks, give --time-offset auto."
     )
     return clock_offset, [warning] if is_doubtful else []
 
@@ -358,7 +366,7 @@ def _comparison_warnings(
     has_motion = np.ptp(reference.position_m, axis=0).any()
     if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
         yield (
-            f"The estimate has a scale factor error: {scale:.3g} fits best. The alignment "
+            f"The scale factor of the estimate is {scale:.3g} instead of 1. The alignment "
             f"{alignment} does not correct the scale."
         )
 
@@ -423,9 +431,9 @@ def _move_to_reference_body(
 def _with_reference_body_axes(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Rotate the body axes of the estimate to those of the reference: camera against vehicle.
+    """Rotate the camera axes of the estimate to the vehicle axes of the reference, or the reverse.
 
-    The constant rotation between them is estimated, so it is no error.
+    The constant rotation between camera and vehicle is estimated, so it is no error.
     """
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
@@ -440,5 +448,6 @@ def _with_reference_body_axes(
     rotation = (aligned_estimate.rotation.inv() * reference.rotation).mean()
     return replace(aligned_estimate, rotation=aligned_estimate.rotation * rotation), (
         "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
-        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include their lever arm.",
+        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
+        "lever arm between vehicle and camera.",
     )

@@ -58,7 +58,10 @@ class Delta:
 
 
 class Statistics(Record, frozen=True):
-    """Statistics of ``count`` errors in the unit of the errors; ``std`` divides by ``count``."""
+    """Statistics of ``count`` errors, in the unit of the errors.
+
+    The standard deviation ``std`` divides by ``count``.
+    """
 
     count: Count
     rmse: NotNegative
@@ -192,7 +195,7 @@ def find_pairs(
     candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
     distance_error = np.abs(travelled[candidates] - travelled[start, None] - delta.value)
     best_candidate = np.argmin(distance_error, axis=1)
-    # Of several poses with equal distance (at rest) the first is used
+    # If several poses have an equal distance (at rest), the first is used
     first_equal = np.searchsorted(travelled, travelled[candidates[start, best_candidate]])
     is_near = distance_error[start, best_candidate] <= DELTA_TOLERANCE * delta.value
     return start[is_near], np.maximum(first_equal, start + 1)[is_near]
@@ -230,7 +233,9 @@ def relative_error(
     scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
     if not len(start):
         no_pair = Unavailable(
-            analysis_name, f"no pair of poses with a distance of {delta}", "Use another delta."
+            analysis_name,
+            f"the reference has no pair of poses with a distance of {delta}",
+            "Use another distance of RPE pairs (delta).",
         )
         return RelativeError(
             delta.value, delta.unit, all_pairs, "reference", no_pair, no_pair, no_pair
@@ -263,13 +268,17 @@ def relative_error(
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the orientations of both trajectories; Unavailable if either has none."""
+    """Return the orientations of both trajectories.
+
+    The result is Unavailable if a trajectory has no orientations.
+    """
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
+    role = "reference" if aligned_estimate.rotation else "estimate"
     return Unavailable(
         analysis_name,
-        f"the {'reference' if aligned_estimate.rotation else 'estimate'} has no orientation",
-        "Give a trajectory with orientation.",
+        f"the {role} has no orientations",
+        f"Give a trajectory with orientations as {role}.",
     )
 
 
@@ -303,7 +312,7 @@ def rmse_interval(
     )
     if n < MIN_BOOTSTRAP_BLOCKS * length:
         return Unavailable(
-            f"interval of the {analysis_name} RMSE",
+            f"95 % interval of the {analysis_name} RMSE",
             f"the errors are correlated over {length} of {n} samples, so there are fewer than "
             f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",

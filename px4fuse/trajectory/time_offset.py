@@ -30,7 +30,8 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 GRID_STEP_S = 0.05
 # Maximum number of samples of the time grid on which speeds are correlated
 MAX_GRID_SAMPLES = 200_000
-# Standard deviation (s) of the filter for speeds, because differentiated positions are noisy
+# Standard deviation (s) of the Gaussian filter of positions, because differentiated positions are
+# noisy
 SMOOTHING_S = 0.25
 # Minimum overlap (s) of the two trajectories in time
 MIN_OVERLAP_S = 5.0
@@ -60,8 +61,8 @@ MAX_MISFIT = 0.5
 # Ratio of the residual to the extent of the motion below which two fits are equally good
 MIN_MISFIT = 1e-3
 # The free velocity is the component of the velocity that a similarity transform cannot explain:
-# only this component determines the time offset
-# Minimum free velocity (RMS) as fraction of the speed
+# only this component determines the time offset. Minimum free velocity (RMS) as fraction of the
+# speed
 MIN_FREE_SPEED_FRACTION = 0.05
 # Minimum correlation of the free velocities of both trajectories, which excludes noise
 MIN_FREE_CORRELATION = 0.5
@@ -138,8 +139,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
     if not candidates:
         return _not_determinable(
-            "the speeds are not correlated at any offset (no motion, constant speed, or different "
-            "flights)"
+            "the speeds of both trajectories are not correlated at any time offset (no motion, "
+            "constant speed, or different flights)"
         )
     coarse_fits = [
         _refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates
@@ -148,7 +149,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     accepted_fits.sort(key=lambda fit: fit.misfit)
     if not accepted_fits:
         return _not_determinable(
-            "the offsets with correlated speeds do not fit the positions, or the overlap is short"
+            "the time offsets with correlated speeds do not fit the positions, or both "
+            "trajectories overlap for a short time only"
         )
     best_fit = accepted_fits[0]
     similar_fits = [
@@ -162,7 +164,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     elif distant_fits:
         return _not_determinable(
-            "the motion is periodic: with an offset that differs by "
+            "the motion is periodic: with a time offset that differs by "
             f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
@@ -210,10 +212,13 @@ def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
-    """Compute speed, and angular speed with orientations, on a time grid; mask the gaps."""
+    """Compute speed and, from orientations, angular speed on a time grid.
+
+    Also return a mask of the times outside of gaps.
+    """
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
-    # Interpolated between key frames, but not across gaps with lost tracking
+    # Speeds are interpolated between key frames, but not across gaps with lost tracking
     is_known = is_bracketed(grid, time, max(10.0 * median_interval(trajectory.time_s), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
@@ -226,7 +231,7 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
-    """Find the offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
+    """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
     spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse_track, dense_track)]
     step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
     if min(spans_s) < 10 * step_s:
@@ -267,7 +272,7 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
 
 @dataclass(frozen=True)
 class _OffsetFit:
-    """Least-squares fit of the offset near one candidate.
+    """Least-squares fit of the time offset near one correlation peak.
 
     Attributes
     ----------
@@ -346,7 +351,10 @@ def _correlation_length(values: Array) -> int:
 def _refine_offset(
     sparse_track: Trajectory, dense_track: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
-    """Minimise the ATE over offsets around a candidate; None if too few poses overlap."""
+    """Minimise the ATE over time offsets within ``window_s`` of ``lag_s``.
+
+    Return None if too few poses overlap.
+    """
     time = sparse_track.time_s
     gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_track.time_s))
     # The same poses are used at every offset, so that the objective is continuous

@@ -46,8 +46,8 @@ from px4fuse.verification.pdf_input import (
     resolve_reference,
 )
 
-# Maximum difference (pt) of equal coordinates: different OpenBLAS kernels move points by at most
-# 0.07 pt, and 0.25 pt is not visible
+# Maximum difference (pt) of coordinates that count as equal: different OpenBLAS kernels move points
+# by at most 0.07 pt, and 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
 # Relative and absolute tolerance of PDF numbers that are not coordinates: other programs save them
 # as 32-bit floats
@@ -58,12 +58,12 @@ MAX_KERNING = 200.0
 # Maximum ratio of submitted to redrawn page content (bytes): PDF may write a character as four
 # bytes
 MAX_CONTENT_RATIO = 4
-# Maximum time (s) for comparing two PDFs; the largest report needs 3 s
+# Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-# PDF dictionary keys that are not compared, because programs that save a PDF again change them
+# PDF dictionary keys that are not compared: programs that save a PDF again change the values
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
 _XMP_WRITER_FIELDS = re.compile(
@@ -75,15 +75,15 @@ MAX_XMP_BYTES = 100_000
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
-    "/AA": "an action",
+    "/AA": "an automatic action",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
     "/CropBox": "a crop box",
     "/OCProperties": "layers",
-    "/OpenAction": "an action",
+    "/OpenAction": "an automatic action",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "another unit of length",
+    "/UserUnit": "a unit of length",
     "/XObject": "a picture or form",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
@@ -216,11 +216,11 @@ class _PdfComparison:
             submitted_value, redrawn_value, key = remaining_values.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
-                raise LimitReachedError("the PDF has too many values")
+                raise LimitReachedError("the PDF contains too many values")
             if isinstance(submitted_value, IndirectObject):
-                if submitted_value.generation:  # some programs ignore the generation
+                if submitted_value.generation:  # some programs ignore generation numbers
                     yield PageDifference(
-                        page, f"the PDF entry {key} is an object of a later generation", True
+                        page, f"the PDF entry {key} refers to an object of a later generation", True
                     )
                 if isinstance(redrawn_value, IndirectObject):
                     pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
@@ -231,16 +231,17 @@ class _PdfComparison:
                 resolve_reference, (submitted_value, redrawn_value)
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                yield PageDifference(page, f"the PDF entry {key} is of another type", True)
+                yield PageDifference(
+                    page, f"the type of the PDF entry {key} differs from the redrawn report", True
+                )
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._dictionaries(
                     submitted_value, redrawn_value, key, page, remaining_values
                 )
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
-                    expected = f"px4fuse writes {len(redrawn_value)}"
-                    description = f"the array {key} has {len(submitted_value)} elements; {expected}"
-                    yield PageDifference(page, description, True)
+                    lengths = f"{len(submitted_value)} elements, not {len(redrawn_value)}"
+                    yield PageDifference(page, f"the PDF array {key} has {lengths}", True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
                 remaining_values += [(*pair, key) for pair in pairs][::-1]
@@ -266,7 +267,7 @@ class _PdfComparison:
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
             description = f"{feature} is missing"
             if name in submitted_keys:
-                description = f"{feature} that px4fuse does not write"
+                description = f"the PDF contains {feature} that px4fuse does not write"
             yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
@@ -295,11 +296,13 @@ class _PdfComparison:
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
     ) -> Iterator[PageDifference]:
         kind = redrawn_stream.get("/Type")
-        if kind == "/EmbeddedFile":  # the attached results, which are compared as numbers
+        if kind == "/EmbeddedFile":  # the attached results are compared as numbers
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield PageDifference(page, f"the PDF entry {key} has another compression", True)
+            yield PageDifference(
+                page, f"the compression of the PDF entry {key} is not supported", True
+            )
             return
         data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if data == redrawn_data or (
@@ -355,7 +358,7 @@ def _ambiguities(pdf: bytes) -> Iterator[str]:
     """Describe structures of a PDF that make different programs read different objects."""
     end = _END_OF_FILE.search(pdf[-1024:])
     if end is None:
-        yield "the file has bytes after its end"
+        yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
         # the end of the file must refer to the first cross-reference table
         begin = pdf.find(b"endobj") + len(b"endobj")
@@ -422,7 +425,7 @@ def _drawing_operations(content: bytes) -> Iterator[Operation]:
 
 def _unescaped(match: re.Match[str]) -> str:
     escaped = match[1]
-    if escaped is None:  # any end of line
+    if escaped is None:  # an end of line in a PDF string is a line feed
         return "\n"
     if escaped[0] in "01234567":
         return chr(int(escaped, 8) & 255)

@@ -41,7 +41,7 @@ MAX_MISSING_OBJECTS = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
-_COSTLY_REASON = "reading the PDF needs more memory or time than reading a report."
+_COSTLY_REASON = "reading the PDF takes more memory or time than reading a report."
 
 # Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test of 900 PDFs with
 # changed bytes. Other exceptions are errors of px4fuse and are not caught
@@ -116,13 +116,13 @@ def attached_results(pdf: bytes, name: str) -> Results:
             if reader.is_encrypted:
                 raise ResultsError(_ENCRYPTED_REASON)
             if not 0 < len(reader.pages) <= MAX_PAGES:
-                raise ResultsError(f"the PDF has no pages, or more than {MAX_PAGES}.")
+                raise ResultsError(f"the PDF has no pages, or more than {MAX_PAGES} pages.")
             return read_results(_attachment(reader), f"the attached {RESULTS_NAME}")
     except ResultsError as error:
         reason, remedy = f"{error.reason}.", error.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY_REASON
-    except DependencyError:  # pypdf needs a further library for AES
+    except DependencyError:  # pypdf cannot decrypt AES without another library
         reason = _ENCRYPTED_REASON
     except BROKEN_PDF_ERRORS:
         reason = _ENCRYPTED_REASON if b"/Encrypt" in pdf else _DAMAGED_REASON
@@ -170,7 +170,7 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
     """
     header = pdf[start : start + 2]
     if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
-        return 0  # RFC 1950, section 2.2: not zlib data
+        return 0  # not zlib data (RFC 1950, section 2.2)
     inflate = zlib.decompressobj()
     input_bytes = output_bytes = 0
     while not inflate.eof and max(input_bytes, output_bytes) <= limit:
@@ -238,7 +238,7 @@ def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[st
         names = [_pdf_name(filter_object) for filter_object in filters if filter_object is not None]
         if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) != len(names):
             filter_names = " ".join(name or "?" for name in names[:3])
-            yield f"a stream with other compression ({one_line(filter_names, 60)})"
+            yield f"a stream with unsupported compression ({one_line(filter_names, 60)})"
 
 
 def resolve_reference(value: Any) -> Any:
@@ -266,7 +266,7 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
         objects = map(resolve_reference, contents)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
     if features:
-        raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike a report.")
+        raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike all reports.")
     if not files and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "

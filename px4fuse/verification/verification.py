@@ -46,17 +46,17 @@ LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Maximum relative difference of equal numbers. On another processor, sums over a flight differ in
-# the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS kernels differ by
-# at most 3e-8 (six flights)
+# Maximum relative difference of numbers that count as equal. On another processor, sums over a
+# flight differ in the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS
+# kernels differ by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE = 1e-6
-# Maximum absolute difference of equal numbers near zero
+# Maximum absolute difference of numbers near zero that count as equal
 ABSOLUTE_TOLERANCE = 1e-9
-# Maximum relative difference of equal estimates, which minimise a cost. Minima are flat: if the
-# cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends of its 95 %
-# interval in the 4th. Pages print up to three digits
+# Maximum relative difference of estimates that count as equal. The minimum of the cost is flat: if
+# the cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends of its
+# 95 % interval in the 4th. Pages print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Maximum absolute difference of equal estimates near zero
+# Maximum absolute difference of estimates near zero that count as equal
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Beginnings of the paths of estimates in the results
 ESTIMATE_PATHS = (
@@ -88,7 +88,7 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# Results of the new run, and a function that draws their report with the recorded student
+# Results of the new run, and a function that draws the report of these results
 Recomputed = tuple[ReportedResults, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
@@ -125,7 +125,7 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
             else:
                 analysis, new_results = _repeat_comparison(results, link_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
-    except SettingsError as error:  # px4fuse would have rejected these settings too
+    except SettingsError as error:  # px4fuse rejects these settings, so no report can contain them
         return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_ADVICE)
     except NotRepeatableError as error:
         return cannot_verify(*error.args)
@@ -255,7 +255,7 @@ def verify(
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
-        reason = f"none of the {len(logs)} given files is the log (SHA-256 {expected_hash})"
+        reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {name} to --logs."
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
@@ -281,7 +281,7 @@ def _verify_with_log(
 ) -> Verdict:
     redrawn_pdf = draw()
     if redrawn_pdf == pdf:
-        reason = "the new run on the log gives an identical PDF"
+        reason = "a new run on the log gives an identical PDF"
         return Verdict(
             "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
         )
@@ -441,7 +441,7 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     """
     if first_text == second_text:
         return True
-    # texts and numbers alternate in the lists
+    # the split lists contain texts and numbers in turn
     pieces, other_pieces = _NUMBER.split(first_text), _NUMBER.split(second_text)
     numbers = zip(pieces[1::2], other_pieces[1::2], strict=False)
     return pieces[::2] == other_pieces[::2] and all(

@@ -15,8 +15,8 @@ from px4fuse.results.answer_form import update_renamed_values
 # Maximum size (bytes) of an answer key: the key of 1000 students has two million bytes
 MAX_KEY_BYTES = 20_000_000
 KEY_NOTE = (
-    "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
-    "it out, and do not put it into the students' folder."
+    "For the instructor only: this file lists the injected faults of every student's flight. Do "
+    "not hand it out, and do not put it into the students' folder."
 )
 _Text = Annotated[str, Meta(max_length=1000)]
 _Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]

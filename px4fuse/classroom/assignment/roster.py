@@ -105,7 +105,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(
             f"{path} contains {len(people)} students.",
-            f"Give a class list with 1 to {MAX_STUDENTS}.",
+            f"Give a class list with 1 to {MAX_STUDENTS} students.",
         )
     stems: dict[str, Person] = {}
     for person in people:

@@ -39,12 +39,12 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Return the index of the column with the first title that exists; None if none exists."""
+        """Return the index of the column with the first of ``titles`` that exists, or None."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell of a row in the column with the first title that exists, or ""."""
+        """Return the cell in the column with the first of ``titles`` that exists, or ""."""
         column_index = self.column(titles)
         return "" if column_index is None else row[column_index].strip()
 
@@ -85,7 +85,7 @@ def read_sheet(path: Path) -> Sheet:
         SettingsError,
         MAX_TABLE_BYTES,
         name=str(path),
-        size_remedy="Give a CSV table of one class",
+        size_remedy="Give a CSV table of one class.",
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")

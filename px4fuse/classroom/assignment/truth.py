@@ -33,9 +33,9 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 SIZE_TOLERANCE = 0.15
 # Tolerance (m) of the loop closure error in a right answer
 CLOSURE_TOLERANCE_M = 0.3
-# Minimum fraction of samples rejected by EKF2 for which a complete answer must name rejections
+# Minimum fraction of samples rejected by EKF2, for which a right answer must name rejections
 MIN_REJECTED_FRACTION = 0.005
-# Minimum position reset of EKF2 (m) that a complete answer must name
+# Minimum position reset of EKF2 (m) that a right answer must name
 MIN_RESET_M = 0.2
 # Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
 EKF2_START_S = 5.0
@@ -167,7 +167,7 @@ def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return behaviour of EKF2 that a complete answer names, and further behaviour not wrong."""
+    """Return EKF2 behaviours that a right answer must name, and others that it may name."""
     size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
         [behaviour for behaviour, kinds in BEHAVIOUR_RULES[rule].items() if kinds & size_of.keys()]

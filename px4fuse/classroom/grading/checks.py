@@ -37,7 +37,7 @@ from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE_LENGTH = 160
-BOTH_AXES_ADVICE = " (the axes north and east are required: omit --axis)"
+BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
 # Regular expression of one character that is not a control character
 _PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
 Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*$")]
@@ -155,7 +155,7 @@ class CheckInput:
         except ValueError as error:
             return f"your answer form cannot be read ({shorten_text(str(error))})"
         if answers.log_sha256 != log_sha256(self.results):
-            return "your answer form was made for another log than your report"
+            return "your answer form and your report are about different logs"
         return answers
 
     @cached_property
@@ -171,7 +171,7 @@ class CheckInput:
         if isinstance(self.form, str):
             return self.form
         if self.answer.form is None:
-            return "the answer key contains no right answers to the form"
+            return "the answer key contains no right answers for this log"
         return form_points(self.form, self.answer.form)
 
     def has_finding(self, *ids: str) -> bool:
@@ -185,7 +185,7 @@ class CheckInput:
             for _, reason in values_at(self.values, f"{parent}.reason"):
                 return format_reason(reason)
             parent = parent.rpartition(".")[0]
-        return BOTH_AXES_ADVICE if HORIZONTAL in path else ""
+        return format_reason(BOTH_AXES_ADVICE) if HORIZONTAL in path else ""
 
 
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
@@ -227,8 +227,8 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
 class NumberItem(RubricItem, frozen=True, tag="number"):
     """Check that a number of the report is within bounds.
 
-    If ``path`` matches several numbers, the worst counts. Outside the bounds the points decrease
-    linearly to zero at ``zero_at``; without ``zero_at`` the points are zero.
+    If ``path`` matches several numbers, the number with the fewest points counts. Outside the
+    bounds the points decrease linearly to zero at ``zero_at``; without ``zero_at`` they are zero.
     """
 
     path: Text
@@ -346,20 +346,17 @@ def _score_tuning(check_input: CheckInput, name: Sigma, factor: float = 2.0) -> 
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
     if name == "sigma_z_m" and check_input.has_finding("source_may_drift", "source_drift"):
-        # innovations do not show the drift of a source, so each SIGMA_Z up to the error of KF is
-        # right
+        # innovations do not show the drift of a source, so SIGMA_Z may be as large as KF's error
         high = max(high, _largest_source_error_m(comparison))
     deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
-    interval_text = (
-        f"the 95 % interval of the maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit})"
-    )
-    statement = f"Your {label} {chosen_value:.3g} {unit} is"
-    if deviation_factor == 1.0:
-        return 1.0, f"{statement} within {interval_text}."
-    side, factor_text = "above" if chosen_value > high else "below", format_factor(deviation_factor)
+    side, factor_text, advice = "within", "", ""
+    if deviation_factor > 1.0:
+        side = "above" if chosen_value > high else "below"
+        factor_text = f" by a factor of {format_factor(deviation_factor)}"
+        advice = f" Set {option} within this interval."
     return fraction_for_deviation(deviation_factor, factor), (
-        f"{statement} {side} {interval_text} by a factor of {factor_text}. "
-        f"Set {option} within this interval."
+        f"Your {label} {chosen_value:.3g} {unit} is {side} the 95 % interval of the "
+        f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}){factor_text}.{advice}"
     )
 
 
@@ -391,16 +388,20 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         side = "small" if nis_result.nis_mean > 1.0 else "large"
-        factor_text = format_factor(nis_result.sigma_error_factor)
-        statement = f"The reported σ of KF is {factor_text} times too {side}"
+        factor = nis_result.sigma_error_factor
+        fraction = fraction_for_deviation(factor, self.factor)
+        advice = (
+            "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
+            "errors that are not white noise."
+        )
         if all(_score_tuning(check_input, name)[0] == 1.0 for name in NOISE_SETTINGS):
-            return 1.0, (
-                f"{statement}. SIGMA_A and SIGMA_Z are within their 95 % intervals, so other "
-                "settings do not make KF consistent."
+            fraction = 1.0
+            advice = (
+                "SIGMA_A and SIGMA_Z are within their 95 % intervals, so other settings do not "
+                "make KF consistent."
             )
-        return fraction_for_deviation(nis_result.sigma_error_factor, self.factor), (
-            f"{statement}. Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and "
-            "look for errors that are not white noise."
+        return fraction, (
+            f"The reported σ of KF is {format_factor(factor)} times too {side}. {advice}"
         )
 
 
@@ -426,17 +427,21 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
             return 1.0 if check_input.answer is not None else fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
-        statement = f"You applied a time offset of {applied_s:.3f} s"
+        statement = (
+            f"You applied a time offset of {applied_s:.3f} s. The 95 % interval of the estimate is "
+            f"{low:.3f} to {high:.3f} s."
+        )
         if low - self.margin_s <= applied_s <= high + self.margin_s:
-            return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
+            return 1.0, statement
         if check_input.has_finding(*CHANGING_CLOCK_FINDINGS):
             mistakes = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
             if any(mistake.kind in ("clock-jump", "clock-drift") for mistake in mistakes):
-                return 1.0, "The time offset changes in your flight, as your form states."
-            statement = "The time offset changes in your flight. State the time in your form."
-            return self.undeterminable, statement
-        statement = f"{statement}, but the estimate is {low:.3f} to {high:.3f} s (95 %)"
-        return 0.0, f"{statement}. Use --clock-offset auto."
+                return 1.0, "The time offset changes during your flight, as your form states."
+            return self.undeterminable, (
+                "The time offset changes during your flight. State the time of the change in your "
+                "form."
+            )
+        return 0.0, f"{statement} Use --clock-offset auto to apply the estimate."
 
 
 # ------------------------------------------------------------------ check of a loop
@@ -444,8 +449,7 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
 # Maximum distance (m) between take-off and landing place of a closed loop
 MAX_CLOSED_LOOP_M = 0.5
-# Fraction of the points for a smaller ATE, if the report has no reference trajectory to compute the
-# ATE
+# Fraction of the points for a smaller ATE if the report has no ATE (no reference trajectory)
 NO_REFERENCE_FRACTION = 0.5
 
 
@@ -474,20 +478,22 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             reason_text = format_reason(getattr(unavailable, "reason", ""))
             return 0.0, f"Your report contains no loop closure error{reason_text}."
         if loop.is_absolute_track:
-            reason = "The track in your report does not drift. Use odometry, for example LOG:vio."
+            reason = (
+                "The track in your report does not drift. Analyse odometry, for example LOG:vio."
+            )
             return 0.0, reason
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
-        statement = f"You measured a loop closure error of {error_text} after {path_text}"
-        if not is_accepted:
-            return 0.25, f"{statement}. No closure was accepted."
-        quarter_count, comment = _score_corrections(loop.corrections)
-        return (2.0 + quarter_count) / 4.0, f"{statement}. The closure was accepted. {comment}"
+        quarter_count, comment = _score_corrections(loop.corrections) if is_accepted else (-1.0, "")
+        return (2.0 + quarter_count) / 4.0, (
+            f"You measured a loop closure error of {error_text} after {path_text}. "
+            f"{'A' if is_accepted else 'No'} loop closure was accepted. {comment}"
+        ).rstrip()
 
 
 def _score_corrections(
     corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
 ) -> FractionAndReason:
-    """Return the quarters of the points: 1 for a corrected path, 1 more for a smaller ATE."""
+    """Return the number of quarters of the points: 1 for a corrected path, 2 for a smaller ATE."""
     correction_names: tuple[CorrectionName, ...] = (
         "by_distance_plain",
         "by_distance",
@@ -509,10 +515,11 @@ def _score_corrections(
             "The path was corrected. The report contains no ATE: add a trajectory with --reference."
         )
     before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
-    statement = f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m"
-    if after_m < before_m:
-        return 2.0, f"{statement}."
-    return 1.0, f"{statement}. Explain why the correction increases the error."
+    is_better = after_m < before_m
+    advice = "" if is_better else " Explain why the correction increases the error."
+    return 1.0 + is_better, (
+        f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m.{advice}"
+    )
 
 
 def _ate_by_reference(correction: object) -> dict[str, float]:

@@ -39,7 +39,7 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     MISSING_REPORT: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
-FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "set by instructor")
+FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
@@ -76,9 +76,9 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         ),
         rows=[_class_row(entry, items, numbers) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
-        groups=(("items", "Points of each item"), ("numbers", "Numbers")),
+        groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
-        full_table_note="All rows are in class.csv.",
+        full_table_note="The table class.csv contains all rows.",
     )
 
 
@@ -135,7 +135,7 @@ def _entry_tags(entry: Entry) -> list[str]:
         tags += [
             f"missed: {mistake}" for mistake, is_named in report.mistakes.items() if not is_named
         ]
-    return tags + ["set by instructor"] * bool(entry.overrides or entry.comment)
+    return tags + ["changed by instructor"] * bool(entry.overrides or entry.comment)
 
 
 def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
@@ -161,7 +161,9 @@ def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Ro
     # overrides.csv identifies students by id or file; a row with pseudonym has neither
     boxes = (_point_boxes(entry),) if entry.student_id or file else ()
     # a row with pseudonym has no link, because the file name may contain the student's name
-    links = [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
+    links = (
+        [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
+    )
     link_sections = (frame.links_section("Report", links),)
     return Row(cells, tuple(_entry_tags(entry)), (*_entry_details(entry), *boxes), link_sections)
 
@@ -194,15 +196,15 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
     yield frame.list_section("Flags", entry.flags, is_warning=True)
     actions = [report.instructor_action] if report.instructor_action else []
-    yield frame.list_section("Your decision before the points count", actions, is_warning=True)
+    yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
     yield frame.list_section("Verification", verdict.reasons)
     titles = ("Value", "Report", "New run") if differences else ()
-    yield frame.table_section("Numbers that differ", titles, differences)
+    yield frame.table_section("Numbers that differ in the new run", titles, differences)
     title = "Points (proposed)" if report.instructor_action else "Points"
     item_titles = ("Item", "Points", "Of", "Comment") if items else ()
     yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
-    yield frame.list_section("Mistakes of this flight", named_texts)
+    yield frame.list_section("Injected faults of this flight", named_texts)
     yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
     yield frame.list_section("Other attempts", attempts)
@@ -218,7 +220,7 @@ def _points_cell(entry: Entry) -> Cell:
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
     notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
-    notes += ["set by instructor"] * any(
+    notes += ["changed by instructor"] * any(
         override.points is not None for override in entry.overrides.values()
     )
     text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
@@ -248,4 +250,4 @@ def _point_boxes(entry: Entry) -> Section:
         if title not in max_by_title
     ]
     identity = entry.student_id or (report.submission if report else "")
-    return frame.boxes_section("Your points and comments", identity, rows, other_rows)
+    return frame.boxes_section("Points and comments of the instructor", identity, rows, other_rows)

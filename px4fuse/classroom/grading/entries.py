@@ -182,7 +182,7 @@ def build_entries(
         else Entry(person.name, person.student_id, None, max_points=max_points)
         for student_index, person in enumerate(register.people)
     ]
-    flag = "Neither the report nor the platform names a student."
+    flag = "Neither the report nor the learning platform names a student."
     if has_list:
         flag = "The student is not in the class list."
     rows += [replace(row, flags=(flag, *row.flags)) for *_, row in attempts[None]]
@@ -206,7 +206,7 @@ def _collect_students(
         if person.numbers or person.login:
             if register.student_index(person) is not None:
                 continue
-            # if another student has this id already, only the platform identifies this student
+            # the id in the report is not used if another student has it already
             free_id = report.student_id if stated_index is None else ""
             student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
@@ -234,7 +234,7 @@ def _make_attempt(
     )
     late_s, flags = None, []
     if due_time is not None and time is not None:
-        # UNIX times are subtracted, because datetime ignores daylight saving in one time zone
+        # UNIX times, because differences of datetimes ignore daylight saving within a time zone
         late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
     elif origin.is_late:
         flags.append(
@@ -247,7 +247,7 @@ def _make_attempt(
         )
     if origin.is_imitated:
         flags.append(
-            "The file name looks like a file name of a platform, but a student wrote it "
+            "The student imitated the file name of a learning platform "
             f"(platform of the export: {platform or 'none'})."
         )
     stated_index = register.student_index(Person(report.student_id)) if platform else None
@@ -281,14 +281,13 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
     # several reports of one submission have the same time; points are the second sort key
     ordered = sorted(attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission))
-    # reports without open action of the instructor are preferred, then other reports, then other
-    # files
+    # preferred: reports without open action of the instructor, then other reports, then other files
     with_report = [attempt for attempt in ordered if attempt[1].version]
     without_action = [attempt for attempt in with_report if not attempt[1].instructor_action]
     eligible = without_action or with_report or ordered
     chosen_key, chosen_report, entry = {
         "latest": eligible[-1],
-        # of several reports in the first submission, the report with the most points
+        # the first submission may contain several reports: the report with the most points
         "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
         "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]
@@ -297,18 +296,20 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     forms = [report.form for sort_key, report, _ in eligible if sort_key == chosen_key]
     # students must not hand in several forms with different guesses, of which the best would count
     if course.attempt != "best" and len(set(forms)) > 1:
-        action = f"Ask which of {len(forms)} reports counts: their forms differ."
+        action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
     elif len(forms) > 1 and any(chosen_key):
-        flags.append(f"{len(forms)} reports have the same time; the best one counts.")
+        flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
     for sort_key, report, _ in ordered:
         if (
             report in other_reports
             and sort_key >= chosen_key
             and (report.instructor_action or not report.version)
         ):
-            reason = "is pending" if report.version else "is not a report"
-            flags.append(f"{one_line(report.submission, 80)} {reason}, so another file counts.")
+            status = "pending" if report.version else "no report"
+            flags.append(
+                f"The file {one_line(report.submission, 80)} does not count (status: {status})."
+            )
     return replace(
         entry, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
     )
@@ -383,10 +384,10 @@ def read_overrides(path: Path) -> Overrides:
         problem = ""
         if item_title in overrides[student]:
             item_text = one_line(item_title, 40) or "(whole report)"
-            problem = f"a second row for student {one_line(student, 40)}, item {item_text}"
+            problem = f"student {one_line(student, 40)} has another row for item {item_text}"
         elif points and (value is None or value < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r}: give a number of 0 or more, and an item or total"
+            problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
@@ -454,7 +455,9 @@ def parse_late_rule(text: str) -> LateRule:
     """
     match = _LATE_RULE.fullmatch(text.strip())
     if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
-        raise SettingsError(f"--late {text!r} is not a rule. Use 10%/day or 10%/day up to 50%.")
+        raise SettingsError(
+            f"--late {text!r} is not a deduction, such as 10%/day or 10%/day up to 50%."
+        )
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
     max_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
     return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction)

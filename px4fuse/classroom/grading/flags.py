@@ -21,16 +21,14 @@ from px4fuse.verification.model import Verdict
 
 # Minimum number of equal numbers in two answer forms for flagging them as copies
 MIN_SAME_NUMBERS = 3
-# Maximum relative difference of equal numbers: a copy may have small changes
+# Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
-# Minimum fraction of the log between --start and --end of a report without a flag
+# Minimum fraction of the log that --start and --end must include; otherwise a flag is raised
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between --drift or --heading-drift and its default value, for a report without a
-# flag
+# Maximum factor between --drift or --heading-drift and its default; otherwise a flag is raised
 MAX_DRIFT_FACTOR = 4.0
-# Maximum number of reports with equal contents that a flag lists
 MAX_LISTED_REPORTS = 4
-# Pairs of reports with equal contents
+# Pairs of reports with equal contents, for example the same answer form
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
@@ -59,11 +57,11 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if has_segment and fraction < MIN_SEGMENT_FRACTION:
         yield (
             f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
-            f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the reason."
+            f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask the student for the reason."
         )
     without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
-        yield "The IMU was not used (--input zero)."
+        yield "KF did not use the IMU (--input zero)."
     source = results.source
     tracks_as_received = [track.name for track in source.available if track.path == "as received"]
     if tracks_as_received and source.path != "as received":
@@ -88,7 +86,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
         if not default / MAX_DRIFT_FACTOR <= drift <= default * MAX_DRIFT_FACTOR:
             yield (
                 f"{option} is {drift:g} {unit} per 100 m (default {default:g} {unit}). The test of "
-                "the loop closure depends on this value. Ask for the reason."
+                "the loop closure depends on this value. Ask the student for the reason."
             )
 
 
@@ -129,15 +127,19 @@ def _student_key(report: GradedReport) -> str:
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
-    ("This PDF is identical to that of {}.", attrgetter("sha256"), attrgetter("submission")),
+    ("This PDF is identical to the PDF of {}.", attrgetter("sha256"), attrgetter("submission")),
     (
-        "The id in this report is also in that of {}.",
+        "The id in this report is also in the report of {}.",
         lambda report: normalise_text(report.student_id),
         attrgetter("submission"),
     ),
-    ("This report is about the same log as that of {}.", attrgetter("log_sha256"), _student_key),
     (
-        "The numbers are those of {}, but the log has another SHA-256: it is a changed copy.",
+        "This report is about the same log as the report of {}.",
+        attrgetter("log_sha256"),
+        _student_key,
+    ),
+    (
+        "The report has the numbers of {}, but another SHA-256 of the log: it is a copy.",
         lambda report: (
             report.verdict.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
@@ -156,7 +158,7 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
             (sentence, _same_pairs(reports, key_of, owner_of))
             for sentence, key_of, owner_of in COMMON_CHECKS
         ),
-        ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
+        ("The answer form has the same numbers as the form of {}.", _copied_forms(reports)),
     ):
         texts_by_submission: dict[str, list[str]] = defaultdict(list)
         for report, other_report in chain.from_iterable(map(permutations, pairs)):

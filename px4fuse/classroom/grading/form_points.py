@@ -22,9 +22,9 @@ from px4fuse.results.answer_form import (
     StudentMistake,
 )
 
-# Points that are deducted for each false fault, which the flight does not have
+# Points deducted for each false fault: named in the answer form, but not in the flight
 FALSE_MISTAKE_POINTS = 10.0
-# Number of false faults in an answer form from which its right faults have no points either
+# Minimum number of false faults for which a form gets no points for right faults either
 MAX_FALSE_MISTAKES = 3
 # Fraction of the points if the answer form names a related injected fault
 NEIGHBOUR_FRACTION = 0.4
@@ -41,11 +41,11 @@ TIME_TOLERANCE_S = 2.0
 # Tolerance of a late start or end of an injected fault, as a fraction of the time since the first
 # data
 TIME_TOLERANCE_FRACTION = 0.05
-# Maximum relative error of a computed number with full points
+# Maximum relative error of a computed number for full points
 FULL_TOLERANCE = 0.02
-# Maximum relative error of a computed number with half of the points
+# Maximum relative error of a computed number for half of the points
 HALF_TOLERANCE = 0.10
-# Maximum relative error of the size of an injected fault with half of the points
+# Maximum relative error of the size of an injected fault for half of the points
 HALF_SIZE_TOLERANCE = 0.4
 
 
@@ -133,7 +133,7 @@ def _mistake_feedback(
 ) -> Iterator[str]:
     """Yield a clause for each right or missed injected fault, and one for all false faults."""
     if not matches:
-        yield f"your flight has no mistake{', as your form states' * is_clean_named}"
+        yield f"your flight has no injected fault{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
         if student_mistake is None:
@@ -144,7 +144,7 @@ def _mistake_feedback(
             yield f"you named {mistake.kind}, which is right"
     if false_mistakes:
         kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
-        yield f"your flight does not have {kinds}"
+        yield f"you named faults that your flight does not have: {kinds}"
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
@@ -187,7 +187,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points for four parts of the form: means over all faults."""
+    """Return the fraction of the points for four parts of the form, as means over all faults."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:

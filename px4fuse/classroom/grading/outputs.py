@@ -76,7 +76,7 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# Maximum number of reasons of the verdict in the feedback for a student
+# Maximum number of reasons for a verdict that the feedback for a student lists
 MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
@@ -334,14 +334,14 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
     ]
     columns = assignments if grade_index is None else [grade_index]
-    # Moodle's worksheets have only one grade column: another title is for another table
+    # Moodle's worksheets have only one grade column, so --column may concern another table
     if column_title and (matches or sheet.column(("identifier",)) is None):
         columns = matches
     if len(columns) == 1:
         return columns[0]
-    problem = "the table has several grade columns" if columns else "no grade column matches"
+    problem = "the table has several grade columns" if columns else "no grade column was found"
     titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
-    remedy = f"Name one of them with --column: {one_line(titles, 300)}."
+    remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
 

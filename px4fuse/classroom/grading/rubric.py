@@ -42,10 +42,10 @@ RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.
 TABLE_NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
-    ("mean NIS north", "axes.north.filters.kf.nis_mean"),
-    ("mean NIS east", "axes.east.filters.kf.nis_mean"),
+    ("mean NIS of KF, north", "axes.north.filters.kf.nis_mean"),
+    ("mean NIS of KF, east", "axes.east.filters.kf.nis_mean"),
     (
-        "position RMSE against ground truth, aisle (m)",
+        "position RMSE of KF against ground truth, aisle (m)",
         "axes.aisle.filters.kf.truth.position_rmse_m",
     ),
     ("closure error (m)", "loop.closure_error_m"),
@@ -90,8 +90,9 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         titles = [TOTAL_TITLE, *(item.title for item in self.items)]
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
-                use = "reserved for the sum" if title.casefold() == TOTAL_TITLE else "not unique"
-                raise ValueError(f"the title {title!r} is {use}. Give each item another title")
+                raise ValueError(
+                    f"the title {title!r} is not unique or is reserved. Give items other titles"
+                )
 
 
 def rubric_text() -> str:
@@ -217,11 +218,11 @@ def _foreign_log_advice(check_input: CheckInput) -> str:
     student_id = shorten_text(check_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if check_input.submitter_id:
-        id_text += f", and {shorten_text(check_input.submitter_id)} handed it in"
+        id_text += f", and {shorten_text(check_input.submitter_id)} submitted the report"
     if check_input.answer is None:
         return "The report is not about a log of the answer key. Ask for a report on that log."
     given_to = shorten_text(check_input.answer.student_id)
-    return f"Find out who wrote the report: its log was given to student {given_to}, but {id_text}."
+    return f"Ask who wrote the report: its log was assigned to student {given_to}, but {id_text}."
 
 
 def grade_unreadable(

@@ -140,7 +140,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         notes.append(f"Ignored files (not PDF): {other_count}.")
     if zip_count:
         notes.append(
-            f"Zip files not opened: {zip_count}. Name the export of a platform on the command line."
+            f"Zip files not opened: {zip_count}. Name each exported zip file on the command line."
         )
     if not submission_by_path:
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
@@ -327,7 +327,9 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
     elif entry.file_size > MAX_PDF_BYTES:
         reason = _TOO_LARGE_REASON
     elif entry.file_size > max_bytes:
-        reason = f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times."
+        reason = (
+            f"the zip entry unpacks to more than {MAX_COMPRESSION_RATIO} times its packed size."
+        )
     if reason:
         raise _EntryError(reason)
     # zipfile returns at most the declared size

@@ -20,8 +20,8 @@ ROBUST = "gnc"
 # Labels of the pose graph solutions, by the key in results.json
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
-    "gated": "pose graph, gated",
-    ROBUST: "pose graph, GNC",
+    "gated": "pose graph, gated closures",
+    ROBUST: "pose graph, robust (GNC)",
 }
 
 
@@ -55,7 +55,7 @@ def analyse_graph(
     *,
     run_robust: bool | None = None,
 ) -> tuple[Graph, PoseGraph]:
-    """Test the closures of a pose graph, and optimise it by least squares and robustly.
+    """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
     Edges between successive vertices are odometry, all other edges are closures.
 

@@ -122,8 +122,8 @@ def _test_edge(
         <= _MIN_EIGENVALUE
     ):
         raise TrajectoryError(
-            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
-            "information is zero, or differs too much from the odometry information",
+            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: the "
+            "closure has no information, or information that differs too much from the odometry",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))

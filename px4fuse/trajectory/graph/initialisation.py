@@ -13,7 +13,7 @@ from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equat
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses from the edges; the first pose is kept.
+    """Compute initial poses from the edges without changing the first pose.
 
     The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
     SLAM, section IV-C). Rotation matrices are fitted by linear least squares without the rotation
@@ -58,7 +58,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     """
     d = graph.dimension
     rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
-    model.require_connected(graph, rotation_information > 0.0, "edges with rotation")
+    model.require_connected(graph, rotation_information > 0.0, "edges that measure rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(d), measured_rotation.shape)
     # Minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
@@ -95,14 +95,19 @@ def _solve_positions(
     value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve :func:`normal_equations` by least squares; the result has the shape (n, d, k)."""
+    """Solve :func:`normal_equations` by least squares.
+
+    The result has the shape (n, d, k).
+    """
     solution = solve_normal_equations(
         *normal_equations(
             graph, first_coefficient, second_coefficient, information, value, first_pose
         )
     )
     if solution is None:
-        raise TrajectoryError("The edges do not determine the initial poses", "Give VERTEX lines.")
+        raise TrajectoryError(
+            "The edges do not determine the initial poses", "Give VERTEX lines with initial poses."
+        )
     return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
 
 

@@ -42,9 +42,9 @@ def rotation_matrix(pose: Array) -> Array:
 
 
 def identity(width: int) -> Array:
-    """Return the identity pose; ``width`` is 3 in the plane, 7 in space."""
+    """Return the identity pose; ``width`` is 3 for SE(2) and 7 for SE(3)."""
     pose = np.zeros(width)
-    pose[6:] = 1.0  # w of the quaternion
+    pose[6:] = 1.0  # the identity rotation has w = 1
     return pose
 
 

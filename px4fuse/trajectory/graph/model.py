@@ -13,11 +13,12 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of an information matrix with unit diagonal for a measured direction
+# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a direction that is
+# measured
 MIN_OBSERVED_EIGENVALUE = 1e-9
 # Sources of the initial poses
 FROM_FILE = "the file's vertices"
-FROM_ODOMETRY = "odometry edges composed"
+FROM_ODOMETRY = "composed odometry edges"
 FROM_CHORDAL = "chordal initialisation"
 
 
@@ -170,7 +171,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
             f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",
-            "Add an edge between the parts, or optimise them separately.",
+            "Add an edge between the parts, or optimise each part separately.",
         )
 
 
@@ -183,7 +184,7 @@ def compose_odometry(graph: PoseGraph) -> PoseGraph:
 def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
     """Return the index of the odometry edge from each pose to the next, shape (n - 1,).
 
-    -1 without an edge. Of several edges between two poses the first is used.
+    The index is -1 without such an edge. Of several edges between two poses the first is used.
 
     Parameters
     ----------

@@ -106,8 +106,8 @@ def solve(
     ``robust`` minimises truncated least squares by graduated non-convexity (Yang 2020, eq. 13
     and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). The truncation
     is at the 99 % point of chi-square, with the rank of the closure's information as degrees of
-    freedom. It runs from the least-squares solution and from the initial poses, and the result
-    with the lower cost is used. In this cost a dropped closure costs the 99.9 % point of
+    freedom. The optimisation runs from the least-squares solution and from the initial poses, and
+    the result with the lower cost is used. In this cost a dropped closure costs the 99.9 % point of
     chi-square, the limit of the gate. Finally up to 20 dropped closures are restored one by one if
     that lowers the cost. Final weights are 0 or 1.
 
@@ -131,7 +131,7 @@ def solve(
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
             "The pose graph contains a pose or measurement that is not finite or too large",
-            "Correct the number, or remove the edge.",
+            "Correct the number, or remove the vertex or edge.",
         )
     weights = np.ones(len(is_doubtful))
     minimum = _minimise(graph, start, weights)
@@ -204,7 +204,10 @@ def _minimise(
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Minimise truncated least squares from two starts; truncate only edges that may be false."""
+    """Minimise truncated least squares from two starts.
+
+    Only edges that may be false (``is_doubtful``) are truncated.
+    """
     _, scaled_information = model.scale_to_unit_diagonal(graph.information)
     degrees_of_freedom = np.sum(
         np.linalg.eigvalsh(scaled_information) > model.MIN_OBSERVED_EIGENVALUE, axis=1
@@ -237,7 +240,7 @@ def _solve_gnc(
             lowest_cost = cost
             minimum = trial
             weights = trial_weights
-    model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
+    model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
     return _Minimum(minimum.state, iteration_count, minimum.converged), weights
 
 
@@ -250,7 +253,8 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
     if np.max(chi2_excess) > 0.0:
         control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
-            ratio = np.maximum(state.chi2 / bound, 1e-200)  # not 0; the weight is 1 anyway
+            # avoids a division by zero; the weight is 1 anyway
+            ratio = np.maximum(state.chi2 / bound, 1e-200)
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
             state = stage.state

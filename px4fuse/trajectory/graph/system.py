@@ -14,7 +14,8 @@ from px4fuse.trajectory.graph.model import PoseGraph
 # Option relax of SuperLU: 1 gives the least fill-in. With a value above the default of 10, SuperLU
 # writes outside its workspace (scipy 1.17, shown by valgrind)
 _RELAX = 1
-# Option panel_size of SuperLU; a value above the default of 20 has the same effect
+# Option panel_size of SuperLU. With a value above the default of 20, SuperLU also writes outside
+# its workspace
 _PANEL = 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
@@ -61,7 +62,10 @@ def normal_equations(
 
 
 def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0.0) -> Array | None:
-    """Solve normal equations with damping on the diagonal; None if singular."""
+    """Solve normal equations with damping on the diagonal.
+
+    Return None if the matrix is singular.
+    """
     try:
         factors = splu(
             matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
