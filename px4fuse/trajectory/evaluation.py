@@ -16,6 +16,7 @@ from msgspec import structs
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import OrUnavailable, Record
+from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
