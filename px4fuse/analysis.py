@@ -40,7 +40,7 @@ class Analysis(Comparison, Estimates, Reruns):
     loop : Loop or Unavailable
         Loop closure error of the flight's odometry, and corrected paths.
     findings : tuple of Finding
-        Mistakes of the flight, most severe first, each cause followed by its consequences.
+        Findings about the flight, most severe first, each cause followed by its effects.
     request : ComparisonRequest or None
         None if the analysis was made from a comparison, not from a request.
     """
@@ -62,7 +62,7 @@ class Analysis(Comparison, Estimates, Reruns):
 
     @property
     def main_trials(self) -> list[Trial]:
-        """Re-runs of both filters along the main axis, with statistics before from the log."""
+        """Re-runs of KF and EKF2 along the main axis whose statistics as flown are from the log."""
         main = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main and trial.is_logged]
 
@@ -130,7 +130,7 @@ class WhatIfAnalysis:
 
 
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """Return the failed EKF2 checks of ``--checks``: axis or aiding source, and its verdict.
+    """Return the failed EKF2 checks of the option ``--checks``, as axis or aiding source: verdict.
 
     A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
     biased or not fused for too long.

@@ -1,4 +1,4 @@
-"""Diagnosis of one flight from its request, in the order of the lab.
+"""Diagnosis of one flight from its request, in these steps.
 
 1. read: log → Flight
 2. prepare: position source, time span and axes
@@ -159,7 +159,7 @@ def prepare_comparison(
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
             f"({clock.reason}).",
-            "Give --clock-offset SECONDS, or omit --clock-offset.",
+            "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock.is_significant(clock.remaining_s):
         low, high = clock.interval_s
@@ -175,7 +175,7 @@ def prepare_comparison(
 def intervene(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run both filters with changes."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     model = open_model(
@@ -187,7 +187,7 @@ def intervene(
     )
     steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
     trials = run_interventions(comparison, estimates, model)
-    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
+    if isinstance(model, Model):  # frees memory; later replays are computed again
         model = replace(model, runs=(), intervals={})
     return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
 
@@ -238,7 +238,8 @@ def run_what_if(
         values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
         if sweep.parameter in changes:
             raise SettingsError(
-                f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
+                f"{sweep.parameter} has both a new value and a sweep.",
+                f"Give a value or a sweep of {sweep.parameter}.",
             )
     recordings = ComparisonRequest(log=request.log, system=request.system)
     flight = flight or read_flight(recordings, progress)
@@ -254,7 +255,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
+    except MissingDataError:  # EKF2 can be replayed without KF, too
         if is_default_change:
             raise
     if comparison is not None:
@@ -263,12 +264,6 @@ def run_what_if(
         difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
-            if not changes:
-                name, noise = comparison.source.name, model.inputs.aid.noise
-                raise MissingDataError(
-                    f"{flight.log.name}: this log shows no better noise or delay for {name}.",
-                    f"Give a changed parameter, for example `changes` {noise}=0.1.",
-                )
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
     progress("replaying EKF2 with other parameters")

@@ -9,12 +9,12 @@ from px4fuse.core.record import Record, Span
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
-MAX_LISTED_SPANS = 3  # time spans of a finding; more spans are printed as one range
-MIN_SPAN_S = 0.05  # s; a shorter span is printed as a single time
+MAX_LISTED_SPANS = 3  # maximum number of printed time spans; more spans become one range
+MIN_SPAN_S = 0.05  # minimum duration (s) of a span; a shorter one is printed as a single time
 
 
 class Finding(Record, frozen=True, omit_defaults=False):
-    """Mistake or condition of a flight that the log shows.
+    """Fault or condition of a flight that the log shows.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Finding(Record, frozen=True, omit_defaults=False):
 
     @property
     def when(self) -> str:
-        """Time spans as text; empty if the finding concerns the whole flight."""
+        """Time spans of the finding as text; empty if the finding concerns the whole flight."""
         if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(

@@ -34,7 +34,7 @@ SMALL_SIGMA_A = Card(
         (0.93, "consistent"),
         (1.06, "consistent"),
     ),
-    difference="KF − EKF2: 2.11 m RMS; 0.069 m after the fix.",
+    difference="Position difference KF − EKF2: 2.11 m RMS; 0.069 m after the fix.",
     causes=(
         Cause(
             id="process_noise_near_zero",
@@ -47,7 +47,7 @@ SMALL_SIGMA_A = Card(
                 Action(
                     "KF", commands=("px4fuse compare aisle_uwb.ulg --sigma-a 0.363",), where="shell"
                 ),
-                Action("EKF2", "no change: consistent"),
+                Action("EKF2", "no change: the reported σ is consistent"),
             ),
             reruns=(
                 Rerun(

@@ -191,7 +191,8 @@ def test_aiding_source_findings_state_sensor_and_times() -> None:
         ((9.9,), None, ("note", "EKF2 fused no sample of the barometer for 21 s")),
         ((10.1,), None, None),  # usual: the ground disturbs the pressure
         ((), 0.8, ("warning",
-                   "EKF2 fused no sample of the barometer for 21 s: height error 0.80 m")),
+                   "EKF2 fused no sample of the barometer for 21 s, with a height error of "
+                   "0.80 m")),
     ],
 )  # fmt: skip
 def test_unfused_barometer_is_reported_only_with_height_error(

@@ -145,8 +145,8 @@ def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
     untested = tuple(each for each in ratios if each.against == "source")
     (ranked,) = rank_causes(analysis(), [OFFSET])
     for evaluated, reason in (
-        (ratios, "no change: consistent"),
-        (untested, "no change tested: only ground truth shows the effect of this fault"),
+        (ratios, "no change: the reported σ is consistent"),
+        (untested, "no change: without ground truth no re-run shows the effect of this fault"),
     ):
         cause = make_cause(analysis(), ranked, evaluated, REQUEST)
         assert cause.actions[-1] == Action("KF, EKF2", reason)
@@ -161,7 +161,7 @@ def test_card_of_unreadable_log_shows_first_bytes_and_action(tmp_path) -> None:
              line.wrapped(100)]  # fmt: skip
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
-        "  read     1,200 bytes, beginning with A3 95 80 01 (ULog: 55 4C 6F 67)",
+        "  read     1,200 bytes; the file begins with A3 95 80 01, a ULog with 55 4C 6F 67",
         "  fix      Give the .tlog that the ground station wrote.",
         "No file was written. Exit code 2.",
     ]
@@ -185,6 +185,6 @@ def test_card_explains_why_the_two_verdicts_on_ekf2_differ() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The two verdicts of EKF2 differ: innovations hardly show this fault, ground truth does. "
-        "The re-run above removes most of the error."
+        "The verdicts of EKF2 against source and ground truth differ: innovations hardly show this "
+        "fault. The re-run with the first fix removes most of the position error."
     )

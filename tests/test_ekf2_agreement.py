@@ -83,8 +83,8 @@ def agreeing(
 
 @pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "expected"), [
     (agreeing(s=1.049), 0.0, 0.0, True, "the correlation 1.0000 of"),
-    (agreeing(s=1.051), 0.0, 0.0, False, "replay / log is 1.05"),
-    (agreeing(s=0.949), 0.0, 0.0, False, "replay / log is 0.95"),
+    (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 times"),
+    (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 times"),
     (agreeing(0.95), 0.0, 0.0, True, "the correlation 0.9500"),
     (agreeing(published_m=0.09), 0.0, 0.0, True, "the correlation 1.0000 of"),
     (agreeing(published_m=0.11), 0.0, 0.0, False, "published positions differ by 0.11 m"),

@@ -98,7 +98,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
-    assert "no time in common" in result.reason
+    assert "do not overlap" in result.reason
 
 
 # ----------------------------------------------------------- cases with a known answer

@@ -294,7 +294,7 @@ def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
 
 
 CHECK_FIRST = (
-    "Check the line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+    "Check line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
 )
 
 
@@ -350,7 +350,9 @@ def test_error_beyond_sigma_finding_tests_rmse_after_alignment(
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
-    assert ("The frame is misaligned: horizontal position RMSE 1.00 m" in finding.message) is frame
+    assert (
+        "The position frame is misaligned: horizontal position RMSE 1.00 m" in finding.message
+    ) is frame
     assert (finding.id == "source_drift") is (drifts and not frame)
     if finding.id == "source_drift":
         assert finding.message.startswith(
@@ -472,7 +474,7 @@ def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
         one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
-        assert ("Add the ULog" in finding.remedy) is has_ulog
+        assert ("Give the ULog" in finding.remedy) is has_ulog
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
@@ -500,7 +502,7 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
-    assert "by the positions and the IMU" in finding.message
+    assert "estimated from positions and IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
@@ -844,11 +846,11 @@ def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
-        assert "± 2 % (95 %)" in finding.message
+        assert "± 2 %, 95 %" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
-        assert ("may cover time-correlated errors" in finding.message) is (word == "large")
+        assert ("may include time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
@@ -884,7 +886,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
     truth = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     for known, north_m, reference in (
         (truth, 3.0, "ground truth"),
-        (NONE, 2.0, "the positions around them"),
+        (NONE, 2.0, "the neighbouring positions"),
     ):
         axes = tuple(axis(name, truth=known) for name in ("north", "east"))
         axes[0].axis.measurement_m = np.ones(120)
@@ -903,7 +905,7 @@ def test_position_outlier_finding_states_number_ekf2_rejected() -> None:
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
     one = analysis(axes=(axis(ekf2_innovations=innovations),), tuning=outliers)
     finding = only(source_positions.detect_outliers, one)
-    assert finding.message.endswith("EKF2's gate rejected 2 of the 3.")
+    assert finding.message.endswith("EKF2's gate rejected 2 of the 3 outliers.")
     one.main.ekf2_innovations = innovations[::2]
     assert "gate rejected" not in only(source_positions.detect_outliers, one).message
 
@@ -987,13 +989,13 @@ def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Tr
             late(0.05, interval_s=(0.04, 0.07)),
             0.0,
             "EKF2_EV_DELAY cannot be negative",
-            "Correct the timestamps at the sender.",
+            "Correct the position timestamps before sending.",
         ),
         (
             late(-0.301, interval_s=(-0.4, -0.2)),
             0.0,
             "EKF2_EV_DELAY cannot exceed 300 ms",
-            "Correct the timestamps at the sender.",
+            "Correct the position timestamps before sending.",
         ),
         (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "300 ms late", "Check EKF2_EV_DELAY."),
     ],
@@ -1009,7 +1011,10 @@ def test_recommended_ekf2_delay_stays_in_px4_range(
 
 @pytest.mark.parametrize(
     ("after_m", "remedy"),
-    [(0.5, "Set EKF2_EV_DELAY to 120 ms."), (1.0, "Correct the timestamps at the sender.")],
+    [
+        (0.5, "Set EKF2_EV_DELAY to 120 ms."),
+        (1.0, "Correct the position timestamps before sending."),
+    ],
 )
 def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)

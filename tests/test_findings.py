@@ -349,7 +349,7 @@ def test_source_that_covers_part_of_flight_is_first_finding(
     first, *_ = found(compare_prepared(prepare_comparison(request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
-    assert f"in flight at {at_s} s: EKF2's error is " in first.title
+    assert f"in flight at {at_s} s: EKF2's position error is " in first.title
     assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
     assert ("dead reckoning" in first.message) == (file is None)
 

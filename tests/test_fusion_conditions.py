@@ -86,7 +86,7 @@ def clock(name: str) -> ClockMap:
         (attempt(ekf2={"states": {"tilt_align": on(0.0)}}), "alignment", ("tilt",)),
         (attempt(ekf2={"states": {"yaw_align": on(0.0)}}), "alignment", ("EKF2_MAG_TYPE",)),
         (attempt(ekf2={"states": {"yaw_align": on(0.0)}}, frame="FRD"), None, ()),
-        (attempt(ekf2=rejecting(0.8)), "gate", ("rejects 78 %", "EKF2_EVP_GATE last")),
+        (attempt(ekf2=rejecting(0.8)), "gate", ("rejects 78 %", "EKF2_EVP_GATE only if")),
         (attempt(ekf2=rejecting(0.4)), None, ()),
         (gnss(), None, ()),
         (gnss(parameters={"EKF2_GPS_CTRL": 2.0}), "switch", ("Set EKF2_GPS_CTRL to 3",)),

@@ -170,7 +170,7 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
-    assert reason == "fused by EKF2; the only position in the log"
+    assert reason == "the only position source in the log, fused by EKF2"
     prepared = prepare(flight)
     assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
     # external vision is not reported as missing
@@ -682,9 +682,9 @@ def test_gnss_fix_reconstruction_recovers_missing_fixes(recorded, request):
         flight.ekf2, aids=dict(flight.ekf2.aids) | {"gnss_pos": replace(log, samples=rows)}
     )
     remaining = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
-    made, (note,) = reconstruct_fixes(remaining, ekf2, 0.11)
+    made, note = reconstruct_fixes(remaining, ekf2, 0.11)
 
-    def notes_of(samples: pd.DataFrame) -> tuple[str, ...]:
+    def note_of(samples: pd.DataFrame) -> str:
         aids = dict(ekf2.aids) | {"gnss_pos": replace(log, samples=samples)}
         return reconstruct_fixes(remaining, replace(ekf2, aids=aids), 0.11)[1]
 
@@ -696,13 +696,13 @@ def test_gnss_fix_reconstruction_recovers_missing_fixes(recorded, request):
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert np.isfinite(made[Columns.POSITION]).all(axis=None)
     # no reconstruction from wrong innovations
-    assert notes_of(rows.assign(innovation_north=rows["innovation_north"] + 0.5)) == ()
+    assert note_of(rows.assign(innovation_north=rows["innovation_north"] + 0.5)) == ""
     # nor from a row in the fusion step, whose fix is ambiguous
-    assert notes_of(rows.set_axis(rows.index - 0.03)) == ()
+    assert note_of(rows.set_axis(rows.index - 0.03)) == ""
     unknown = Unavailable("horizon", "not logged", "Log it.")
-    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=unknown), 0.11)[1] == ()
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=unknown), 0.11)[1] == ""
     # a fix older than the horizon is fused at the horizon
-    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=0.05), 0.11)[1] != note
 
 
 def test_gnss_receiver_interval_is_found_from_logged_fixes():

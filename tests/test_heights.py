@@ -228,7 +228,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert "; the height by at most " in found.notes[-1]
+    assert "; the published height differs by at most " in found.notes[-1]
 
 
 def test_what_if_with_long_height_rejection_is_unpredictable() -> None:
@@ -264,7 +264,7 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     assert HEIGHT_LOGGED_NOTE in found.notes
     with pytest.raises(SettingsError, match=r"effect of EKF2_BARO_NOISE cannot .*barometer: "):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
-    with pytest.raises(SettingsError, match=r"baro_hgt: in this log .*barometer: "):
+    with pytest.raises(SettingsError, match=r"baro_hgt cannot be omitted: .*barometer: "):
         what_if(model, [{}], {"baro_hgt": 40.0})
 
 

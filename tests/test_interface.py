@@ -108,7 +108,7 @@ def test_python_compare_with_invalid_arguments_is_rejected(analysis, arguments, 
     with pytest.raises(px4fuse.Px4FuseError) as raised:
         px4fuse.compare(analysis.flight, **arguments)
     assert said in str(raised.value)
-    with pytest.raises(px4fuse.Px4FuseError, match="Axis 'up' was not analysed"):
+    with pytest.raises(px4fuse.Px4FuseError, match="The axis 'up' was not analysed"):
         analysis["up"]
 
 

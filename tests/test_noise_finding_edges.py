@@ -95,14 +95,14 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     [
         ((trial(SIGMA_A_TO_0_1),),
          [("sigma_a_too_large", "error", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1)."),
-          ("sigma_z_too_large", "warning", "Compare with a run with --sigma-z 0.5.")]),
+          ("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5.")]),
         ((trial(BOTH), trial(SIGMA_A_TO_0_1, 9.0)),
          [(name, level, "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1) and SIGMA_Z to 0.5 m (--sigma-z "
            "0.5).")
           for name, level in (("sigma_a_too_large", "error"), ("sigma_z_too_large", "warning"))]),
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
-         [("sigma_z_too_large", "warning", "Compare with a run with --sigma-z 0.5."),
+         [("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5."),
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
     ],
 )  # fmt: skip
@@ -118,7 +118,7 @@ def test_wrong_noise_finding_recommends_the_improving_rerun(trials: Any, expecte
 @pytest.mark.parametrize(
     ("nis_mean", "rmse_m", "expected"),
     [
-        (0.78, None, ("error", "Compare with a run with --sigma-a 0.1.")),
+        (0.78, None, ("error", "Compare this run with one that has --sigma-a 0.1.")),
         (0.78, 0.3, ("note", noises.NO_IMPROVEMENT)),
         (0.5, None, ("note", noises.NO_IMPROVEMENT)),
     ],
@@ -141,15 +141,15 @@ def test_wrong_noise_finding_states_factor_and_estimated_noise() -> None:
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert worse.message == (
-        "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A 1 m/s²; "
-        "maximum-likelihood estimate 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much between "
-        "updates, so the gain is too large."
+        "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A is 1 m/s²; "
+        "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much "
+        "between updates, so the gain is too large."
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
-        "too small: KF lags the motion. SIGMA_A 1 m/s²; maximum-likelihood estimate 9 m/s². P"
-        in (worse.message)
+        "too small: KF lags the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate is "
+        "9 m/s². P" in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -157,9 +157,9 @@ def test_wrong_noise_finding_states_factor_and_estimated_noise() -> None:
 def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
-    assert finding.remedy == "Compare with a run with --sigma-z 0.005."
+    assert finding.remedy == "Compare this run with one that has --sigma-z 0.005."
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
-    assert "estimate at most 0.0021 m. The" in finding.message
+    assert "estimate is at most 0.0021 m. The" in finding.message
 
 
 @pytest.mark.parametrize(
@@ -316,12 +316,13 @@ def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 2.0}, "measurement noise",
          "Set SIGMA_A to 0.3 m/s² (--sigma-a 0.3) and SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"outliers_left_out": 9.0}, "outliers",
-         "Restore line of sight, or remove the outliers at the sender."),
+         "Restore line of sight, or remove the outliers before sending."),
         ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
-         "at the sender. Set SIGMA_Z to 2 m (--sigma-z 2)."),
+         "before sending. Set SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"clock_offset_s": -0.25}, "clock",
-         "Subtract 0.250 s from the timestamps at the sender."),
-        ("kf", {"clock_offset_s": 0.25}, "clock", "Add 0.250 s to the timestamps at the sender."),
+         "Subtract 0.250 s from the position timestamps before sending."),
+        ("kf", {"clock_offset_s": 0.25}, "clock",
+         "Add 0.250 s to the position timestamps before sending."),
         ("kf", {"turned_deg": -20.0}, "frame",
          "Rotate the positions by -20° before they are sent."),
         ("kf", {"bias_forward_m_s2": 0.5, "bias_right_m_s2": 0.1}, "accelerometer",
@@ -373,8 +374,10 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     ("one", "estimate", "parameters", "text"),
     [
         (fused(0.1), Noise(0.3, 0.2, 0.4), {}, "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
-        (fused(0.1), Noise(0.124, 0.12, 0.13), {}, "The noise of EKF2 (0.1 m) is right: check"),
-        (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {}, "The noise of EKF2 (0.1 m) is right"),
+        (fused(0.1), Noise(0.124, 0.12, 0.13), {},
+         "EKF2's measurement noise (0.1 m) is right: check"),
+        (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {},
+         "EKF2's measurement noise (0.1 m) is right"),
         # a smaller noise than the sender reports: its variances must not be used
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
          "Set EKF2_EVP_NOISE to 0.1 m and EKF2_EV_NOISE_MD to 1 (EKF2"),
@@ -410,7 +413,7 @@ def test_noise_of_overconfident_ekf2_is_advised_without_replay(
         (0.1, "uwb", 0.0,
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
         (0.5, "gnss", 0.44,
-         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
+         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what KF and EKF2 assume: EKF2 "
           "rejects 44 % of the positions")),
     ],
 )  # fmt: skip
@@ -493,9 +496,9 @@ def test_possible_source_drift_finding_states_closure_error() -> None:
     ):  # fmt: skip
         one = analysis(source=ODOMETRY, tuning=tuned(noise), loop=closing(1.25))
         finding = only(hidden_errors.detect, one)
-        assert f"noise from sample to sample is {bound}{value} m" in finding.message
+        assert f"noise between successive positions is {bound}{value} m" in finding.message
         assert finding.evidence["short_term_noise_m"] == value
-        assert "closure error is 1.25 m after 50 m." in finding.message
+        assert "closure error is 1.25 m after a path of 50 m." in finding.message
     assert named(hidden_errors.detect, analysis(source=MOVING)) == {}
     unclosed = only(hidden_errors.detect, analysis(source=ODOMETRY, loop=closing(None)))
     assert "closure error" not in unclosed.message
@@ -508,7 +511,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
 @pytest.mark.parametrize(
     ("loop", "size"),
     [
-        (closing(1.42, 88.0, END), "loop closure error 1.42 m after 88 m (1.6 %)"),
+        (closing(1.42, 88.0, END), "loop closure error 1.42 m after a path of 88 m (1.6 %)"),
         # the landing place is only assumed, or the track does not drift
         (closing(1.42, 88.0, replace(END, assumed=True)), None),
         (closing(1.42, 88.0, END, is_absolute_track=True), None),

@@ -100,7 +100,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
 
 @pytest.mark.parametrize(("made", "axis", "segment", "says"), [
     (with_innovations(flight(), north=NORTH), "north", Segment(20.0, 30.0, ""),
-     "no samples in the segment"),
+     "the log contains no EKF2 innovations in the analysed time span"),
     # the aisle needs both horizontal axes
     (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
     (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),

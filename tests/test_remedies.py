@@ -204,7 +204,7 @@ def only(name: str, analysis: Analysis) -> Finding:
 def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> None:
     """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
-    assert finding.remedy == "Correct the timestamps at the sender."
+    assert finding.remedy == "Correct the position timestamps before sending."
     # ground truth contradicts --clock-offset too
     found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
     assert found == ["ekf2_ev_delay_wrong"]

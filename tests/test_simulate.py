@@ -321,7 +321,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
     (AISLE, ["open-end"], "requires --kind loop"), (UNFILTERED, ["ekf2-noise"], "--no-ekf2"),
     (LOOP, ["open-end=7"], "Use at most 6 m"),
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
-    (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
+    (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no messages"),
 ])  # fmt: skip
 def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):

@@ -159,7 +159,7 @@ def test_tuned_noise_at_end_of_search_range_has_one_bound() -> None:
 def test_tune_with_too_few_measurements_is_unavailable() -> None:
     short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
-    assert short.what == "tuning, down"
+    assert short.what == "estimate of the noises (down)"
     assert f"only {MIN_MEASUREMENTS - 1} measurements" in short.reason
     enough = tuned(modelled(1, MIN_MEASUREMENTS))
     assert isinstance(enough.held_out, Unavailable)

@@ -505,7 +505,7 @@ def test_what_if_without_gnss_uses_vision() -> None:
     none = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel", "ev_pos"), 40.0))
     assert "EKF2_NOAID_TOUT" in none.notes[-1]
     with pytest.raises(
-        SettingsError, match="in this log the replay fuses only gnss_pos, gnss_vel, mag"
+        SettingsError, match="replay of this log fuses only gnss_pos, gnss_vel, mag"
     ):
         what_if(on_gnss(), [{}], {"ev_pos": 40.0})
 

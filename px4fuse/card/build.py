@@ -50,35 +50,37 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.model import group_by_root
+from px4fuse.findings.model import format_count, format_percent, group_by_root
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 for a sentence on the card
+# Minimum fraction of positions that EKF2 rejected, for the card to state it
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
-# Aiding sources whose √S is usually too large with PX4's default noises, which is no fault
+# Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
-    "σ too large against the source is not a fault here: the source may drift, and innovations do "
-    "not show drift. Do not lower the noises for it."
+    "A σ that is too large against the source is not a fault here: the source may drift, and "
+    "innovations do not show drift. Do not reduce noise settings because of it."
 )
-SHOWN_BYTE_COUNT = 4  # number of bytes of an unreadable log that its card shows
-ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog
+SHOWN_BYTE_COUNT = 4  # number of bytes at the start of an unreadable log that the card shows
+ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_HIDES_ERROR = (
-    "Both filters rotate the measured acceleration by the wrong heading and return to the position "
-    "at each update, so the innovations show little of the error."
+    "KF and EKF2 rotate the measured acceleration by the wrong heading. Each update corrects the "
+    "position, so innovations show little of the position error."
 )
-UNEXPLAINED_DIFFERENCE = "The two verdicts differ, and no tested change explains it."
+UNEXPLAINED_DIFFERENCE = (
+    "The verdicts against source and ground truth differ, and no tested change explains it."
+)
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
-# Explanation of differing verdicts, by the ids of findings about the position source
+# Reasons why verdicts against source and ground truth differ, by ids of findings about the source
 SENTENCES_BY_SOURCE_FAULT = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
-        "KF runs with the corrected source. EKF2 used the source as it was sent.",
+        "KF uses the corrected positions. EKF2 used the positions as they were sent.",
     ),
     (
         {
@@ -87,8 +89,8 @@ SENTENCES_BY_SOURCE_FAULT = (
             "source_frame_misaligned",
             "source_position_jump",
         },
-        "Both filters follow the faulty positions, so their innovations show little of the error. "
-        "Ground truth shows it.",
+        "KF and EKF2 follow the faulty positions, so innovations show little of the position "
+        "error. Ground truth shows the error.",
     ),
 )
 
@@ -157,7 +159,7 @@ def build_card(
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Build the card of a flight without a position source."""
+    """Build the diagnosis card of a flight without a position source, as :func:`build_card`."""
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
@@ -191,7 +193,7 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     with suppress(LogError):  # the headline states the reason if the file cannot be read
         head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
         size = file_size(path, LogError)
-        facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
+        facts["read"] = f"{size:,} bytes; the file begins with {head}, a ULog with {ULOG_HEAD}"
     if error.remedy:
         facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
     return Card(
@@ -281,7 +283,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     is_part = max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
     when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
-        return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
+        return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
@@ -293,25 +295,27 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
         for verdict in verdicts:
             if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
                 sentences.append(
-                    f"The error of {FILTER_NAMES[verdict.filter]} is {format_ratio(verdict.ratio)} "
-                    "times its reported σ."
+                    f"The position error of {FILTER_NAMES[verdict.filter]} is "
+                    f"{format_ratio(verdict.ratio)} times its reported σ."
                 )
         sentences += _worst_axis_sentences(analysis)
     if effect.difference_rms_m is not None and (
         not effect.position_rmse_m or all(each.word == "consistent" for each in verdicts)
     ):
-        sentences.append(f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS.")
+        sentences.append(
+            f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS."
+        )
     if not effect.position_rmse_m:
         sentences.append(
-            "The log has no ground truth, so it does not show which filter is more accurate."
+            "The log has no ground truth, so the position errors of KF and EKF2 are unknown."
         )
     if (
         rejected_fraction := effect.rejected_fraction
     ) is not None and rejected_fraction >= MIN_NAMED_REJECTION:
-        sentences.append(f"EKF2 rejected {100.0 * rejected_fraction:.0f} % of the positions.")
+        sentences.append(f"EKF2 rejected {format_percent(rejected_fraction)} of the positions.")
     if effect.horizontal_resets:
-        times = "once" if effect.horizontal_resets == 1 else f"{effect.horizontal_resets} times"
-        sentences.append(f"EKF2 reset its horizontal position {times}.")
+        reset_count = format_count(effect.horizontal_resets)
+        sentences.append(f"EKF2 reset its horizontal position {reset_count}.")
     return " ".join(sentences)
 
 
@@ -353,7 +357,7 @@ def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most three recommended actions."""
+    """Return at most MAX_ACTIONS recommended actions, each as one sentence."""
     texts: list[str] = []
     for number, cause in enumerate(causes, 1):
         sentences = [_action_sentence(action) for action in cause.actions if _is_change(action)]
@@ -385,7 +389,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark inconsistent verdicts of filters that need no change.
+    """Mark inconsistent verdicts that do not require a change of the filter.
 
     If the source may drift, a σ that is too large against the source is not a fault.
     """
@@ -415,7 +419,7 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return EKF2's error ÷ σ at the fusion horizon if it is consistent only there, else None.
+    """Return EKF2's error ÷ σ at the fusion horizon, or None if EKF2 is not consistent only there.
 
     The published position includes the lag of EKF2's output predictor, which σ does not describe.
     """
@@ -435,13 +439,14 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
 
 def _horizon_sentence(ratio: float) -> str:
     return (
-        "EKF2's published position includes the lag of its output predictor, which σ does not "
-        f"describe. At the fusion horizon its error ÷ σ is {format_ratio(ratio)}: consistent."
+        "EKF2's published position lags because of its output predictor, and σ does not include "
+        f"this lag. At the fusion horizon, EKF2's position error is {format_ratio(ratio)} times "
+        "σ: consistent."
     )
 
 
 def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> str:
-    """Explain why verdicts against source and ground truth differ; "" if they agree."""
+    """Explain why verdicts against source and ground truth differ; an empty text if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
@@ -465,8 +470,9 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
         return (
-            f"The two verdicts of {filters} differ: innovations hardly show this fault, ground "
-            "truth does. The re-run above removes most of the error."
+            f"The verdicts of {filters} against source and ground truth differ: innovations "
+            "hardly show this fault. The re-run with the first fix removes most of the position "
+            "error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -476,13 +482,13 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
         ):
             noise = f" of {format_metres(sigma)} m"
         return (
-            f"The noise of the source{noise} is less than both filters assume. The drift of the "
-            "source does not appear in the innovations, so only ground truth shows it."
+            f"The position noise{noise} is less than KF and EKF2 assume. Innovations do not show "
+            "the drift of the source, ground truth does."
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
-            "Innovations show only the error that changes from sample to sample. Both filters "
-            "follow the slow error, so only ground truth shows it."
+            "Innovations show only position errors that change from sample to sample. KF and "
+            "EKF2 follow slow position errors, so only ground truth shows them."
         )
     unexplained_text = (
         HEADING_HIDES_ERROR if "ekf2_heading_error" in finding_ids else UNEXPLAINED_DIFFERENCE
@@ -499,25 +505,25 @@ def _verdicts_differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> 
 
 
 def _gate_sentence(analysis: Analysis) -> str:
-    """Explain that EKF2's gate rejected positions, so its state is better than its innovations."""
+    """Explain that rejected positions increase EKF2's mean NIS but do not change its state."""
     innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # else EKF2 has no verdict
+    assert not isinstance(innovations, Unavailable)  # without innovations EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]
     ratio = math.sqrt(
         float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
     )
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
-        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, so they did not "
-        "change its state, although their innovations are evaluated. Over the accepted positions, "
-        f"EKF2's innovation ÷ √S is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions: they did not "
+        "change EKF2's state, but its mean NIS contains them. Without them, the RMS of EKF2's "
+        f"innovation ÷ √S is {format_ratio(ratio)}."
     )
 
 
 def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
-    text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
+    text = f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
     trials = ranked_causes[0].trials
     filter_names = {
         trial.filter
@@ -526,7 +532,8 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     }
     if len(filter_names) == 2:
         return (
-            f"{text}. The fault affects both filters equally, so this difference does not show it."
+            f"{text}. The fault affects KF and EKF2 equally, so their difference does not "
+            "show the fault."
         )
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
     filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
@@ -570,7 +577,7 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("sigma_z_m", "SIGMA_Z", "m"),
         ("dt_s", "DT", "s"),
     ):
-        value, origin = getattr(settings, name), "set by option"
+        value, origin = getattr(settings, name), "set by the user"
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):

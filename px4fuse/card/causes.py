@@ -1,7 +1,8 @@
 """Causes on the diagnosis card: order, actions, and the re-runs of KF and EKF2 that test them.
 
 A finding is a numbered cause if a re-run with its correction changes a σ ratio or the position
-RMSE, or if no re-run can show its effect. A change of a filter is proposed only if it helps.
+RMSE, or if no re-run can show its effect. A change of a filter is proposed only if its
+re-run improves position or σ.
 """
 
 import math
@@ -26,11 +27,12 @@ from px4fuse.comparison.trials import (
     ratios,
     reduction,
 )
-from px4fuse.core.text import with_log_name
+from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
@@ -64,7 +66,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "imu_samples_missing",
     "ekf2_not_fusing",
 )
-# Ids of findings that only repeat a verdict on σ; the card lists them without any other cause only
+# Ids of findings that only repeat a verdict on σ; the card lists them only if no other cause exists
 VERDICT_FINDINGS = frozenset(
     {
         "error_exceeds_reported_sigma",
@@ -75,11 +77,11 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of changes that move both filters with the position source, which only ground truth shows
+# Kinds of changes whose effect only ground truth shows: KF and EKF2 move with the position source
 UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 # Endings of the names of parameters that PX4 reads only at boot (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of positions rejected by EKF2 for a column in the table of re-runs
+# Minimum fraction of positions that EKF2 rejected, for the table of re-runs to show it
 MIN_SHOWN_REJECTION = 0.005
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
@@ -90,12 +92,16 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Target of the action against a finding, by id, if it differs from the target of its group
+# Device or filter to be changed, by id of the finding, if it differs from TARGETS of its group
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
 
 
 class RankedCause(NamedTuple):
-    """Finding with the re-runs that test it; the card lists causes in ascending tier."""
+    """Finding with the re-runs that test it, and its rank on the card.
+
+    The card lists causes in ascending ``tier``. ``reduction`` is the decrease of |ln σ ratio| in
+    the re-runs.
+    """
 
     finding: Finding
     tier: int
@@ -104,12 +110,12 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Return the causes of a flight in the order of the card.
+    """Rank the findings that no other finding causes, in the order of the card.
 
     1. Findings that make the verdicts meaningless.
     2. Findings whose re-run makes a filter consistent.
     3. Findings whose re-run halves the logarithm of a σ ratio.
-    4. Other errors, and settings that leave the error against ground truth unchanged.
+    4. Other findings of severity error, and settings that hardly change the error ÷ σ.
     5. Other warnings.
 
     Within a tier, faults of the position source precede settings that would only hide them.
@@ -119,7 +125,8 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.main_trials, finding)
-        if finding.id in VERDICT_FINDINGS:  # a verdict is a cause even if no re-run improves it
+        # the card lists an inconsistent filter even if no re-run improves the verdict
+        if finding.id in VERDICT_FINDINGS:
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
@@ -157,10 +164,10 @@ def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that test a finding: the best one of each kind of change and filter.
+    """Return the re-runs that test a finding: the best one for each filter and kind of change.
 
-    The best re-run has the smallest change that makes a filter consistent, else the ratios nearest
-    to 1. Of KF, the re-run with default settings is included.
+    The best re-run has the smallest change that makes a filter consistent, else the σ ratios
+    nearest to 1. A noise finding also has the re-run of KF with default settings.
     """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
@@ -173,13 +180,13 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if the effect of a re-run is visible only in ground truth and there is none."""
+    """Return False if only ground truth would show the effect of a re-run, and the log has none."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def is_useful(trial: Trial) -> bool:
-    """Return True if a re-run is better than the flight, or if no ground truth can show it."""
+    """Return True if a re-run improves position or σ, or if :func:`can_show_effect` is False."""
     return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
@@ -189,7 +196,7 @@ def make_cause(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Make the cause of a finding, with actions for the sender, KF and EKF2."""
+    """Make the card's entry of a finding, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
@@ -203,7 +210,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make the cause of a finding without re-runs."""
+    """Make the entry of a finding on the card, without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -221,7 +228,7 @@ def _make_actions(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return the alternatives, of which one is enough, and the other actions."""
+    """Return the alternative groups of actions, one of which is enough, and the other actions."""
     finding = ranked_cause.finding
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
@@ -235,8 +242,8 @@ def _make_actions(
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
             offset.filter == "kf"
         )
-        verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
-        sender = Action("sender", f"{verb} the timestamp (usec) of each position")
+        add_or_subtract = lower_first(format_shift(shift))
+        sender = Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
         if analysis.source.origin.is_gnss and general_action is not None:
             sender = general_action  # a GNSS receiver does not let the user shift its timestamps
         if delay is not None:
@@ -257,10 +264,10 @@ def _make_actions(
             defaults = by_kind["kf", "defaults"].change if is_default else {}
             actions.append(run_again(request, trial.change, defaults))
         elif filter_name == "ekf2" and kind != "delay":
-            # with corrected timestamps EKF2 may need a longer fusion horizon
+            # with corrected timestamps EKF2 may need a larger EKF2_DELAY_MAX
             parameters = {n: value for n, value in trial.change.items() if n in PARAMETERS}
             actions += [set_parameters(analysis, parameters)] if parameters else []
-    # actions on KF are last, because the vehicle must be corrected first
+    # KF actions are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
     reasons = {
@@ -277,7 +284,7 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, verdicts: Sequence[Verdict]
 ) -> str:
-    """Return the reason why a filter needs no change, or "" if it is not evaluated."""
+    """Return the reason why a filter needs no change; an empty text if it was not evaluated."""
     words = {
         verdict.against: verdict.word
         for verdict in verdicts
@@ -287,13 +294,13 @@ def _no_change_reason(
         return ""
     if set(words.values()) == {"consistent"}:
         if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_CHANGE_KINDS:
-            return "no change tested: only ground truth shows the effect of this fault"
-        return "no change: consistent"
+            return "no change: without ground truth no re-run shows the effect of this fault"
+        return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
-            return "no option rejects outliers; do not raise --sigma-z for them"
+            return "no option of KF rejects outliers; do not increase SIGMA_Z (--sigma-z) instead"
         if words.get("truth", "consistent") == "consistent":
-            return "no change: the gate rejects outliers, and the reported σ is consistent"
+            return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
     return (
         f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
     )
@@ -308,12 +315,12 @@ def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
 def run_again(
     request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
 ) -> Action:
-    """Return the action to run KF with changed settings."""
+    """Return the action to run KF with changed settings, or with equally good ``defaults``."""
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
     )
-    sentence = f"run again without {options}, or with" if options else ""
+    sentence = f"run again without {options}, or with the estimate" if options else ""
     return Action("KF", sentence, (command,), "shell")
 
 
@@ -380,15 +387,15 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _closing_sentence(
     analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
-    """Return the sentence below the table of re-runs."""
+    """Return the sentence below a cause's table of re-runs; empty if none applies."""
     if alternatives:
         return (
-            "Not both: the offset would be corrected twice. One offset, two signs: --clock-offset "
-            "(this log only) is added to the timestamps (s), the delay parameter is the age of a "
-            "position (ms)."
+            "Take only one of these actions: both correct the same time offset. Their signs "
+            "differ: --clock-offset (s, this log only) is added to the timestamps, the delay "
+            "parameter (ms) is the age of a position."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return "KF is consistent with both values. The default needs no option."
+        return "KF is consistent with the default and with the estimate."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
@@ -396,10 +403,16 @@ def _closing_sentence(
         default = analysis.flight.log.default_of(next(iter(trial.change)))
         sigma_z = horizontal_tuning.sigma_z
         if (sigma_z.low or 0.0) <= default <= (sigma_z.high or 0.0):
-            return f"PX4's default of {default:g} m is within the 95 % interval, so it is as good."
+            return (
+                f"PX4's default of {default:g} m is inside the 95 % interval of the estimate, so "
+                "it is equally good."
+            )
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]
     if ratios_after and classify_ratio(min(ratios_after), "truth") == "overconfident":
-        return "Against ground truth, σ stays too small after this fix: another error remains."
+        return (
+            "After this fix, the reported σ is still too small against ground truth: another "
+            "error remains."
+        )
     return ""

@@ -1,4 +1,4 @@
-"""Summary of a report (headline, verdicts, causes, actions); part of the JSON results."""
+"""Records of the diagnosis card (headline, verdicts, causes, actions), part of the JSON results."""
 
 import math
 from collections.abc import Mapping
@@ -18,19 +18,19 @@ FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 # Limits of the σ ratio of a consistent filter: against the source, and against ground truth
 SIGMA_RATIO_BANDS = CONSISTENT_RATIOS
-# Ends of the logarithmic axis of σ ratios; ratios beyond are drawn as triangles
+# Ends of the logarithmic axis of σ ratios; triangles at the ends show ratios beyond them
 AXIS_ENDS = (0.1, 10.0)
 # Ticks of the logarithmic axis of σ ratios, with their labels
 AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Maximum number of causes on a card; more causes are counted
+# Maximum number of causes on a card, which states the number of further causes
 MAX_CAUSES = 3
-# Maximum number of notes on the cover and the terminal; more notes are counted
+# Maximum number of notes on the cover and the terminal, which state the number of further notes
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
 
 def axis_fraction(ratio: float) -> float:
-    """Return the position of a σ ratio on the logarithmic axis (0 to 1).
+    """Return the place of a σ ratio on the logarithmic axis of the card (ends at 0 and 1).
 
     >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
     (0.0, 0.5, 1.0)
@@ -56,9 +56,9 @@ class Verdict(Record, frozen=True, kw_only=True):
     samples : int
         Number of innovations or errors.
     reason : str
-        Missing data if the ratio is not evaluated.
+        Missing data, if the ratio is not evaluated.
     is_explained : bool
-        True if the card names the cause and nothing has to be changed for this filter.
+        True if the card explains the ratio and this filter needs no change.
     """
 
     filter: FilterName
@@ -72,7 +72,7 @@ class Verdict(Record, frozen=True, kw_only=True):
 
     @property
     def is_loud(self) -> bool:
-        """True if the σ ratio is outside its band and the card does not explain this."""
+        """True if the filter is inconsistent and the card does not explain this."""
         return self.word in ("overconfident", "underconfident") and not self.is_explained
 
 
@@ -113,7 +113,8 @@ class Action(Record, frozen=True):
     commands : tuple of str
         Complete lines; a shell command contains the name of the log.
     where : {"shell", "console", ""}
-        Place where the commands are typed: the shell of the computer, or the MAVLink console.
+        Place where the commands are typed: the shell of the computer, or the MAVLink console;
+        empty without commands.
     """
 
     target: Target
@@ -130,9 +131,9 @@ class Rerun(Record, frozen=True, kw_only=True):
     label : str
         Filter and change: "KF without the 26 outliers", "EKF2 (replay)".
     is_prediction : bool
-        True for EKF2, whose replay starts at ``from_s``.
+        True for a replay of EKF2, which starts at ``from_s``; False for KF.
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        Each as flown, and after the change.
+        Value as flown, and value with the change; None if unknown.
     improves : str
         Quantities that the change improves.
     """
@@ -160,14 +161,14 @@ class Cause(Record, frozen=True, kw_only=True):
     why : str
         Effect of the fault on KF and EKF2.
     spans_s : tuple of (float, float)
-        Times of the fault; empty for the whole flight.
+        Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
         Groups of actions that exclude each other; one group is sufficient.
     actions : tuple of Action
         Actions that are necessary with each alternative.
     reruns : tuple of Rerun
     after : str
-        Sentence below the table of re-runs: signs and units, or a value that is as good.
+        Sentence below the table of re-runs, for example on an equally good value.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -225,7 +226,10 @@ class Identity(Record, frozen=True, kw_only=True):
 
 
 class AidRow(Record, frozen=True, kw_only=True):
-    """Ratio of innovation to √S along one axis of an aiding source."""
+    """RMS ratio of innovation to √S along one axis (``component``) of an aiding source.
+
+    ``is_usual`` is True if a ratio below its band is usual with PX4's default noises.
+    """
 
     label: str
     component: str
@@ -239,30 +243,31 @@ class Card(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     severity : str
-        Severity of the first cause; clean without a cause.
+        Severity of the first cause. Without a cause: "note" with an unexplained inconsistent
+        verdict, else "clean"; "refused" for a log that cannot be analysed.
     id : str
-        Id of the first cause, or of the error that prevents an analysis; empty without both.
+        Id of the first cause, or of the error that prevents an analysis; else empty.
     headline : str
-        Fault and size of the first cause.
+        First cause with its magnitude, or the result without a cause.
     effect : Effect or None
     effect_text : str
         Effect in sentences, made from ``effect`` and ``verdicts``.
     do_this : tuple of str
-        The one to three most important actions, also on a flight without a fault.
+        The one to three most important actions; without a fault "Change nothing.".
     verdicts : tuple of Verdict
         KF and EKF2, each against source and ground truth; empty without a position source.
     reconcile : str
         Explanation if two verdicts of one filter differ.
     difference : str
-        Difference KF - EKF2 before and after the first fix.
+        Position difference KF - EKF2 before and after the first fix.
     causes : tuple of Cause
     more_causes : int
-        Further causes, which the card does not list.
+        Number of further causes, which the card does not list.
     notes : tuple of Note
     aids : tuple of AidRow
         Ratios of the aiding sources, on a flight without a position source.
     facts : mapping from label to str
-        Texts on a log that cannot be analysed: bytes read, and fix.
+        Texts on data that cannot be analysed, for example bytes read, and fix.
     identity : Identity
     """
 

@@ -20,7 +20,7 @@ from px4fuse.flight.model import Unavailable
 # Length (s) of the bootstrap blocks: longer than the correlation time of position errors
 BOOTSTRAP_BLOCK_S = 10.0
 BOOTSTRAP_RESAMPLES = 2000
-# Minimum number of blocks: with fewer blocks the interval is far too narrow
+# Minimum number of bootstrap blocks: with fewer the 95 % interval is far too narrow
 MIN_BOOTSTRAP_BLOCKS = 4
 
 
@@ -78,14 +78,15 @@ def _not_evaluated(
 
 
 def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | None:
-    """Return the 95 % interval of an RMS by block bootstrap; None for a short time series.
+    """Return the 95 % interval of an RMS of correlated values, by block bootstrap.
 
-    Künsch (1989), Annals of Statistics 17(3). The seed is fixed, so that the result is repeatable.
+    Return None for fewer than MIN_BOOTSTRAP_BLOCKS blocks. The seed is fixed, so that the result is
+    repeatable. Künsch (1989), Annals of Statistics 17(3).
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
-        Increasing.
+        Increasing times of the values.
     values : ndarray, shape (n,)
     """
     block_count = int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_S) if len(time_s) > 1 else 0

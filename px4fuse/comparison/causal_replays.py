@@ -1,9 +1,9 @@
-"""Causes of inconsistent filters, found by re-running a filter with one change at a time.
+"""Causes of an inconsistent filter, found by re-running the filter with one change at a time.
 
 A discrepancy of a filter is a mean NIS outside its band, or a mean NEES that shows errors larger
-than the reported σ. Changes that may explain it are re-run one by one; if none suffices, the best
-change is combined with each other one. :func:`px4fuse.comparison.trials.find_cause` chooses the
-cause from the re-runs.
+than the reported σ. The filter is re-run with each change that may explain the discrepancy. If no
+change alone explains it, the best change is combined with each other change.
+:func:`px4fuse.comparison.trials.find_cause` chooses the cause from the re-runs.
 """
 
 from __future__ import annotations
@@ -72,21 +72,21 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Maximum mean NIS of innovations that do not show a reported σ that is too small
+# Maximum mean NIS for a position error above the reported σ that innovations do not show
 MAX_UNREMARKABLE_NIS = 1.5
-# Columns of an EKF2 replay for north and east
+# Columns of the updates of an EKF2 replay, for north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
-    "difference KF - EKF2", "the filters use different frames after the change", ""
+    "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
 )
-# Maximum ratio of an RMSE or σ ratio in the log and in the replay of EKF2 as flown
+# Maximum ratio of a statistic (RMSE, σ ratio) of the logged EKF2 and of its replay, to use the log
 MAX_REPLAY_FACTOR = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
-    """Position error against ground truth that is larger than the reported σ."""
+    """Position error of a filter against ground truth that is larger than its reported σ."""
 
     nees: float
     rmse_m: float
@@ -119,9 +119,9 @@ class Reruns:
     Attributes
     ----------
     ekf2_model : Model or Unavailable
-        Model of EKF2 for replays; ``agreement`` compares a replay with the log.
+        Model of EKF2 for replays; its ``agreement`` compares the replay as flown with the log.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Differences KF - EKF2 after each replacement of one KF property by that of EKF2.
+        Difference KF - EKF2 in steps, each of which replaces one property of KF by that of EKF2.
     trials : tuple of Trial
         Re-runs along the main axis, and along each axis with a discrepancy.
     """
@@ -135,7 +135,7 @@ Rerun = Callable[[AxisComparison, Change], RunStatistics]
 
 
 class _Filter(NamedTuple):
-    """KF or EKF2, with the function that runs it with a change; only EKF2 has a ``model``."""
+    """KF or EKF2, with the function that re-runs it with a change; only EKF2 has a ``model``."""
 
     name: FilterName
     rerun: Rerun
@@ -149,14 +149,14 @@ class _Filter(NamedTuple):
 def run_interventions(
     comparison: Comparison, estimates: Estimates, model: Model | Unavailable
 ) -> tuple[Trial, ...]:
-    """Re-run both filters along each axis with each change that may explain a discrepancy.
+    """Re-run KF and EKF2 along each axis with each change that may explain a discrepancy.
 
     Parameters
     ----------
     comparison : Comparison
     estimates : Estimates
     model : Model or Unavailable
-        EKF2 of the same flight.
+        Model of EKF2 in the same flight; without it only KF is re-run.
     """
     filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
     if (
@@ -184,7 +184,7 @@ def run_interventions(
 def planned_configurations(
     comparison: Comparison, estimates: Estimates, inputs: Inputs
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 configurations that :func:`run_interventions` needs."""
+    """Return the EKF2 parameter sets that :func:`run_interventions` will replay."""
     if not is_fused_source(comparison, inputs):
         return []
     flown = inputs.settings
@@ -204,12 +204,12 @@ def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[Filt
 def _changes_along(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None, result: AxisComparison
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return the changes to re-run along an axis, with the discrepancies they may explain."""
+    """Return the changes for re-runs along an axis, with the discrepancies each may explain."""
     summary = result.filters["kf" if inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         inputs is not None and result.axis.name == "down"
     ):
-        return []  # the EKF2 replay is horizontal
+        return []  # an EKF2 replay has no vertical position
     has_discrepancy = {
         "nees": error_above_reported_sigma(summary) is not None,
         "nis": is_inconsistent(summary),
@@ -231,7 +231,7 @@ def _changes_along(
 def _try_changes(
     comparison: Comparison, estimates: Estimates, each: _Filter, result: AxisComparison
 ) -> list[Trial]:
-    """Re-run each change along an axis; also pairs, if no change alone explains a discrepancy."""
+    """Re-run a filter with each change, and with pairs of changes if none is sufficient."""
     changes = _changes_along(comparison, estimates, each.inputs, result)
     if not changes:
         return []
@@ -265,9 +265,9 @@ def _try_changes(
 
 
 def _flown_statistics(each: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter as flown, and True if EKF2's are those of the log.
+    """Return the statistics of a filter as flown, and True unless they are of an EKF2 replay.
 
-    EKF2's statistics are taken from the log if a replay of EKF2 as flown has nearly the same ones.
+    EKF2's statistics are from the log if a replay of EKF2 as flown has nearly the same statistics.
     """
     replayed, logged = each.rerun(result, {}), result.ekf2_state
     if each.model is None:
@@ -341,8 +341,8 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if is_gnss_rotation:
-            # GNSS and ground truth both refer to true north, so the attitude is misaligned and
-            # not one of them: the rotation applies to both
+            # GNSS and ground truth refer to true north, so the attitude is misaligned: rotate both
+            # of them
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS in change:
@@ -409,7 +409,7 @@ def _replay_statistics(
     """Return the statistics of an EKF2 replay along an axis."""
     compared_s, axis = model.flown.evaluated_s, result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
-        # the change corrects the attitude, so the axis keeps its direction relative to north
+        # this change corrects the attitude, so the direction of the axis from north does not change
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     weights, updates = axis.direction[:2], ekf2_replay.updates
     updates = updates[inside_spans(updates.index, compared_s)]

@@ -1,6 +1,6 @@
-"""Changes of a filter or of its data that may explain a discrepancy; a re-run tests them.
+"""Changes of a filter or of its data that may explain a discrepancy; re-runs test the changes.
 
-Changes of EKF2 need its ``inputs``; without inputs, the changes are those of KF.
+Functions with the parameter ``inputs`` return changes of EKF2, or changes of KF if it is None.
 """
 
 from collections.abc import Iterable
@@ -29,10 +29,10 @@ from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
-# Minimum SIGMA_Z (m) of a re-run: accuracy of motion capture in flight
+# Minimum SIGMA_Z (m) of a KF re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of a change of KF, by the name of the changed setting or data
+# Kind of change of KF (:attr:`Trial.kinds`), by the key of :attr:`Trial.change`
 KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -44,10 +44,10 @@ KF_KINDS = {
 }
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of estimated SIGMA_A and EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
-# SIGMA_A also covers tilt error and bias
+# Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
+# SIGMA_A contains tilt error and bias, too
 VIBRATION_FACTOR = 3.0
-# EKF2 parameters that are re-run with PX4's default if another value was flown
+# EKF2 parameters for which a re-run uses PX4's default, if the flight had another value
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -56,7 +56,7 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum misalignment in σ of its estimate for a re-run with rotated positions
+# Minimum yaw misalignment, in σ of its estimate, for a re-run with rotated positions
 HEADING_SIGMAS = 3.0
 
 
@@ -67,14 +67,14 @@ def candidate_changes(
     result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
-    """Return the changes that may explain a mean NIS or NEES outside its limits."""
+    """Return the changes that may explain a mean NIS or NEES (``statistic``) outside its limits."""
     summary, origin = result.filters["kf" if inputs is None else "ekf2"], comparison.source.origin
-    assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+    assert isinstance(summary, FilterSummary)  # only a tested filter has a discrepancy
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     tuned = tuning_of_axis(estimates.tuning, result.axis.name)
     changes = list[Change]()
-    # innovations do not show the slow errors of GNSS or of a drifting source, so they do not
-    # justify a smaller noise
+    # innovations do not show slow errors of GNSS or of a drifting source: no reason for a smaller
+    # noise
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if tuned is not None and not (is_underconfident and hides_slow_errors):
         changes += (
@@ -102,10 +102,10 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to re-run along the main axis.
+    """Return the changes for re-runs along the main axis.
 
-    For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
-    the position timestamps.
+    In addition to :func:`candidate_changes`: for KF, both noises together and the default settings;
+    for EKF2 with a changed delay, the same shift of the position timestamps.
     """
     changes = unique_changes(
         change
@@ -128,7 +128,7 @@ def unique_changes(changes: Iterable[Change]) -> list[Change]:
 
 
 def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
-    """Return the kinds of a change, see :attr:`.trials.Trial.kinds`."""
+    """Classify a change for :attr:`.trials.Trial.kinds`."""
     if inputs is None and change == default_settings(comparison):
         return ("defaults",)
     kinds: dict[str, str] = {}
@@ -142,7 +142,7 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 
 def default_settings(comparison: Comparison) -> Change:
-    """Return the default noises of KF, where the user chose others."""
+    """Return the default noises of KF for those settings that the user changed."""
     chosen, default = comparison.settings, Settings()
     names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -158,9 +158,10 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
 
 
 def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
-    """Return the estimated time offset, if the part that is not yet applied is significant.
+    """Return the estimated time offset, if its unapplied part is significant.
 
-    EKF2 discards positions that are older than its fusion horizon, so it may need a longer one.
+    EKF2 discards positions older than its fusion horizon, so the change may also lengthen the
+    horizon.
     """
     clock = estimates.clock
     if isinstance(clock, Unavailable) or not clock.is_determinable:
@@ -193,7 +194,7 @@ def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    """Return the significant accelerometer biases, to be removed."""
+    """Return the estimated accelerometer bias, if significant; the re-run removes the bias."""
     fit = estimates.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or not fit.has_bias:
         return []
@@ -202,16 +203,16 @@ def _without_bias(estimates: Estimates) -> list[Change]:
 
 
 def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
-    """Return the estimated position noise, if it differs significantly from EKF2's."""
+    """Return EKF2 parameters for the estimated position noise, if it differs significantly."""
     noise_m = tuned.sigma_z.value
-    if noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+    if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
     change = ml_noise_change(inputs, tuned.sigma_z, noise_m)
     return [change] if change else []
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
-    """Return PX4's default of each changed noise, and of a gate that is too small."""
+    """Return PX4's default of each changed noise, and of a gate below PX4's default."""
     gate, flown = inputs.aid.gate, inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
     return [

@@ -33,20 +33,20 @@ Frame = pd.DataFrame | Unavailable
 def run_kf(
     prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
-    """Run KF along each axis of a prepared flight."""
-    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
+    """Run KF along each axis of a comparison, and return the runs by axis name."""
+    progress(f"running KF along the axes {', '.join(line.name for line in prepared.lines)}")
     return {line.name: replay(line, prepared.settings) for line in prepared.lines}
 
 
 def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare KF with EKF2, and both with ground truth, along each axis."""
+    """Add the results along each axis: KF against EKF2, and both against ground truth."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [f"EKF2 {note}"] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # without its resets, the state is in another frame than positions at the fusion horizon
+            # EKF2's state without resets has another frame than its positions at the fusion horizon
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
@@ -60,7 +60,7 @@ def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
 
 
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
-    """Compare KF and EKF2 along one axis; ``ekf2`` is without the removed resets."""
+    """Compare KF and EKF2 along one axis; ``ekf2`` is already without resets of its frame."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     state, variance, truth = tracks.values()
@@ -109,7 +109,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, Frame]:
-    """Project EKF2's state and variances, and the ground truth, onto an axis."""
+    """Project EKF2's state, EKF2's variances and the ground truth onto an axis."""
     state: Frame
     variance: Frame
     if isinstance(ekf2, Unavailable):
@@ -158,8 +158,8 @@ def difference(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
     if len(position) < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "difference KF - EKF2",
-            f"KF and EKF2 have only {len(position)} common samples in the segment",
-            "Choose a segment in which EKF2 runs.",
+            f"KF and EKF2 have only {len(position)} common samples",
+            "Choose a time span in which EKF2 runs.",
         )
     return Difference(
         count=len(position),
@@ -184,13 +184,13 @@ def kf_error_statistics(
 
 
 def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF, at EKF2's sample times if available."""
+    """Return state and variances of KF at EKF2's sample times, else at KF's prediction times."""
     frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
     return kf_state_and_variance(kf_run, frame.index.to_numpy())
 
 
 def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at other times (s)."""
+    """Return state and variances of KF at ``times`` (s)."""
     state, variance = (
         pd.DataFrame(dict(zip(columns, state_function(kf_run, times), strict=True)), index=times)
         for columns, state_function in ((STATE_COLUMNS, state_at), (VARIANCE_COLUMNS, variance_at))
@@ -214,8 +214,8 @@ def error_statistics(
     if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth",
-            "filter and ground truth have no common samples",
-            "Choose a segment with ground truth.",
+            "filter and ground truth have no common times",
+            "Choose a time span with ground truth.",
         )
     nees_position, nees_velocity = (
         _mean_nees(error / reported_sigma(state.index.to_numpy(), variance, column))
@@ -238,13 +238,13 @@ def _horizon_nees(horizon: pd.DataFrame | None, truth: Frame) -> float | None:
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
-    """Return the errors of a state against ground truth at its times; NaN if unknown."""
+    """Return the errors of ``state`` against interpolated ground truth; NaN where unknown."""
     true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
     return np.asarray(state[column].to_numpy() - true)
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Interpolate the reported σ to other times (s); NaN if unknown."""
+    """Interpolate a reported variance to ``time_s``, and return σ; NaN where unknown."""
     known = _known_values(variance, column)
     if known.empty:
         return np.full(len(time_s), np.nan)
@@ -259,12 +259,12 @@ def _mean_nees(normalised: Array) -> float | None:
 def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
     """Return position errors (m) and reported σ (m) of one filter along an axis.
 
-    Times are those of EKF2's published state, without EKF2 those of KF's predictions.
+    The times are those of EKF2's published state; without EKF2, those of KF's predictions.
 
     Returns
     -------
     DataFrame or Unavailable
-        ``error_m`` against ground truth, and ``sigma_m``; NaN if unknown.
+        Columns ``error_m`` (against ground truth) and ``sigma_m``; NaN where unknown.
     """
     if isinstance(result.truth, Unavailable):
         return result.truth
@@ -285,7 +285,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
 def normalised_position_errors(
     result: AxisComparison, owner: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return times (s) and position errors divided by the reported σ."""
+    """Return the times (s), and the position errors against ground truth ÷ reported σ."""
     errors = position_errors(result, owner)
     if isinstance(errors, Unavailable):
         return errors
@@ -295,8 +295,8 @@ def normalised_position_errors(
     if normalised.empty:
         return Unavailable(
             "error against ground truth",
-            "no sample has both a reported σ and ground truth",
-            "Choose a segment with a reported σ and ground truth.",
+            "no analysed sample has both a reported σ and ground truth",
+            "Choose a time span with a reported σ and ground truth.",
         )
     return normalised.index.to_numpy(), normalised.to_numpy()
 
@@ -310,6 +310,6 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # the horizontal NIS needs north and east of an update, which have the same timestamp
+    # the horizontal NIS needs the innovations north and east of an update (same timestamp)
     joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

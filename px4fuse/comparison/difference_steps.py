@@ -1,8 +1,9 @@
 """Explanation of the difference KF - EKF2 along each horizontal axis.
 
-Each step of :mod:`px4fuse.ekf2.steps` replaces one property of KF by that of EKF2, until KF has
-become the logged EKF2. For the steps with the largest effect, sentences state the behaviour of KF
-and EKF2, the fraction of the difference, and the time of the largest effect.
+Each step of :mod:`px4fuse.ekf2.steps` replaces one property of KF by that of EKF2. After all
+steps, KF has become the logged EKF2. For the two steps with the largest effect, sentences state
+the behaviour of KF and EKF2, the fraction of the mean square difference, and the time of the
+largest effect.
 """
 
 from collections.abc import Mapping
@@ -30,17 +31,18 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference of the position RMSEs of KF and EKF2 that sentences call the same
+# Maximum relative difference of the position RMSEs of KF and EKF2 for the report to call them equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference for a sentence on the second largest step
+# Minimum fraction of the mean square difference KF - EKF2 for a sentence on the second largest step
 MIN_NOTABLE_SHARE = 0.05
-# Minimum ratio of a KF noise setting and its estimate for the setting to be corrected first
+# Minimum ratio of a KF noise setting to its estimate, or inverse, to correct the setting first
 MIN_SETTING_RATIO = 4.0
-# Minimum change (m) of the position for an EKF2 property to be listed as a step
+# Minimum position change (m) for the report to list an EKF2 property as a step
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum difference KF - EKF2 (m) outside the replayed times for a sentence
+# Minimum position difference KF - EKF2 (m) outside the replayed times for the report to state it
 MIN_UNREPLAYED_M = 0.5
-# Minimum ratio of the largest differences KF - EKF2 outside and inside the replayed times
+# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to that inside, for
+# the report to state it
 MIN_UNREPLAYED_RATIO = 3.0
 
 
@@ -60,17 +62,18 @@ def explain_ekf2_difference(
     clock : ClockOffset or Unavailable
         Estimated age of the positions.
     corrected : mapping from field of Settings to value
-        Wrong settings of KF, which are corrected first (:func:`corrected_settings`).
+        Estimates that replace wrong settings of KF before the first step
+        (:func:`corrected_settings`).
 
     Returns
     -------
     mapping from axis name to DifferenceExplanation or Unavailable
-        "down" only if no horizontal axis was compared: the replay is horizontal only.
+        Without a horizontal axis only "down", as Unavailable: EKF2 replays are horizontal.
     """
     results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not results:
-        reason = "the EKF2 replay covers horizontal positions only"
-        action = "Analyse a horizontal axis, too (--axis)."
+        reason = "EKF2 can be replayed for horizontal positions only"
+        action = "Analyse a horizontal axis, too (for example --axis north)."
         return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
@@ -101,10 +104,10 @@ def explain_ekf2_difference(
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return estimates for the noise settings of KF that are far from their estimate.
+    """Return the noise estimates for those settings of KF that are far from their estimate.
 
-    A wrong setting is a separate cause. Without its correction, each step alone would
-    remove nearly the whole difference.
+    A wrong setting is a separate cause of the difference KF - EKF2. Without its correction, each
+    step alone would remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -125,14 +128,14 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
 def explanation_configurations(
     comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 configurations that :func:`explain_ekf2_difference` needs."""
+    """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
     return list(
         steps.step_configurations(inputs, _settings(comparison, inputs, corrected)).values()
     )
 
 
 def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
-    """Return the corrected settings of KF, without time offset if EKF2 fused another source."""
+    """Return the corrected settings of KF; the time offset is 0 if EKF2 fused another source."""
     settings = _with_changes(comparison.settings, corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
@@ -166,9 +169,9 @@ def add_sentences(
     ----------
     explanation : DifferenceExplanation
     axis_label : str
-        Name of the axis in a sentence.
+        Name of the axis in sentences, for example "the main axis".
     reasons : dict
-        Clauses on the behaviour of KF and EKF2, by step.
+        Clauses on the different behaviour of KF and EKF2, by name of the step.
     """
     reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
     first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
@@ -182,8 +185,8 @@ def add_sentences(
             f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
         )
         sentences.append(
-            f"KF was run with {settings} for this explanation: the wrong setting is corrected "
-            "first, and the steps explain the remaining difference KF - EKF2."
+            f"The wrong noise setting of KF is corrected first ({settings}), and the steps "
+            "explain the remaining difference KF - EKF2."
         )
     sentences.append(f"{cause} {_effect_text(first, explanation)}")
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
@@ -197,8 +200,8 @@ def add_sentences(
     )
     if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
-            "Outside the replayed times (EKF2 starting or not fusing the source) the positions of "
-            f"KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
+            "Outside the replayed times (EKF2 starts or does not fuse positions) the positions "
+            f"of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
@@ -206,12 +209,13 @@ def add_sentences(
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
     share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    share_text = f"{100 * share:.0f} % of the mean square difference"
-    if share > 1.0:  # the fractions of all steps add up to 100 %, so other steps are negative
-        share_text = "more than the whole mean square difference; other steps reduce it"
+    share_text = f"{100 * share:.0f} % of the mean square difference KF - EKF2"
+    # the fractions of all steps add up to 100 %, so those of other steps are negative
+    if share > 1.0:
+        share_text = "more than the mean square difference KF - EKF2, which other steps reduce"
     return (
-        f"Largest position effect: {step.position_moved_m:.2f} m at {step.moved_at_s:.1f} s. This "
-        f"step is {share_text}."
+        f"This step changes the position by up to {step.position_moved_m:.2f} m (at "
+        f"{step.moved_at_s:.1f} s) and is {share_text}."
     )
 
 
@@ -221,8 +225,8 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
         return ""
     samples = f"{rejection_run.samples} sample{'s' if rejection_run.samples > 1 else ''}"
     return (
-        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} in a row "
-        f"and drifted {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
+        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} in a row, and its position "
+        f"drifted by {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
     )
 
 
@@ -241,14 +245,15 @@ def _step_reasons(
         samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
     age_ms = 1e3 * (source.age_s - settings.clock_offset_s)
     delay_text = (
-        f"EKF2 assumes positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF {age_ms:.0f} ms"
+        f"EKF2 assumes that positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF "
+        f"assumes {age_ms:.0f} ms"
     )
     if isinstance(clock, ClockOffset) and clock.is_determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
         delay_text += (
-            f". The maximum-likelihood estimate of their age is {ml_delay_ms:.0f} ms "
-            f"(95 % {low:.0f} to {high:.0f} ms)"
+            f". The maximum-likelihood estimate of the age is {ml_delay_ms:.0f} ms (95 % "
+            f"{low:.0f} to {high:.0f} ms)"
         )
     equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
     imu_weight, position_weight = (
@@ -268,21 +273,22 @@ def _step_reasons(
             f"EKF2 weights the IMU {imu_weight} and the positions {position_weight}"
         ),
         steps.ATTITUDE: (
-            "EKF2 corrects its attitude with the positions; KF uses the logged attitude"
+            "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
         ),
         steps.FIELD_STEP: (
-            "EKF2 estimates heading with the magnetometer; KF uses EKF2's published heading"
+            "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
         steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
         steps.FLOW_STEP: "EKF2 also fuses optical flow; KF uses positions only",
-        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses only one of them",
+        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses one position source",
         steps.GATE: (
-            f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the samples; "
-            "KF has no gate"
+            f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
+            "positions; KF has no innovation gate"
         ),
         steps.OUTPUT: (
-            f"EKF2 fuses {1e3 * inputs.horizon_s:.0f} ms late and predicts to the present with the "
-            f"IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
+            f"EKF2 fuses positions {1e3 * inputs.horizon_s:.0f} ms late, and its output predictor "
+            f"(EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s) predicts the present state; KF has no "
+            "delay"
         ),
     }
 
@@ -298,8 +304,8 @@ def _unexplained_sentence(explanation: DifferenceExplanation) -> str:
     )
     return (
         f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(velocity):.3f} m/s. Fraction of the mean square that the replay does not "
-        f"explain: {position_share} in position, {velocity_share} in velocity."
+        f"{np.sqrt(velocity):.3f} m/s. The replay does not explain {position_share} of the mean "
+        f"square position difference and {velocity_share} of the mean square velocity difference."
     )
 
 
@@ -320,6 +326,6 @@ def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
     step_index = int(np.argmin(changes) if ekf2_rmse_m < kf_rmse_m else np.argmax(changes))
     before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [
-        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. Step with the largest "
-        f"effect from KF to EKF2: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. The step from KF to EKF2 "
+        f"that changes the RMSE most: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
     ]

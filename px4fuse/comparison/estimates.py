@@ -1,9 +1,9 @@
-"""Estimates of noises, time offset and frame misalignment from the data of a comparison.
+"""Estimates of position and acceleration noise, time offset and yaw misalignment of the positions.
 
 Odometry is smooth over seconds and drifts by metres within minutes. A filter that follows odometry
 has small innovations and a large error, so innovations do not give the measurement noise of
-odometry (``Origin.may_drift``). Its scale and heading errors resemble a changing time offset, so
-:func:`widen_for_drift` widens the interval of the time offset.
+odometry (``Origin.may_drift``). Scale and heading errors of odometry resemble a changing time
+offset, so :func:`widen_for_drift` widens the 95 % interval of the time offset.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,11 +41,11 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Minimum ratio of measured and nominal IMU rate: measured rates are up to 2 % lower
+# Minimum ratio of the measured to the needed IMU rate: measured rates are up to 2 % below nominal
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of parts of the flight before and after a change of the time offset
+# Minimum number of estimates of the time offset before and after a tested change in flight
 MIN_PARTS = 2
 
 # Axes of the noise estimates in a report; north and east have one estimate
@@ -62,7 +62,7 @@ class Estimates:
     Attributes
     ----------
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
-        Noises.
+        Measurement noise and process noise.
     clock : ClockOffset or Unavailable
         Time offset between position source and IMU.
     heading : HeadingError or Unavailable
@@ -74,9 +74,9 @@ class Estimates:
     time_correlated_noise : TimeCorrelatedNoise or Unavailable
         Time-correlated noise of the position source, without jumps.
     tuning_by_axis : tuple of AxisTuning
-        Noises along north and east, if their mean NIS differs; not for GNSS and odometry.
+        Separate noises along north and east if their mean NIS differs; not for GNSS and odometry.
     noisy_part : NoisyPart or None
-        Part of the flight with larger innovations; not for odometry.
+        Time span of the flight with larger innovations; not for odometry.
     """
 
     tuning: Tuning
@@ -90,11 +90,11 @@ class Estimates:
 
 
 def ignore_progress(_: str) -> None:
-    """Do nothing with the name of a step."""
+    """Ignore the name of a step of the computation."""
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the noise estimate of the first axis name for which it is available."""
+    """Return the noise estimate of the first of several axis names that has an estimate."""
     estimates = map(tuning.get, names)
     return next((each for each in estimates if isinstance(each, AxisTuning)), None)
 
@@ -105,7 +105,7 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
-    """Estimate noises, time offset, frame misalignment and errors of the source."""
+    """Estimate noises, time offset, yaw misalignment and errors of the source."""
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -128,13 +128,13 @@ def tuned(
     progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Estimate the noises along the axes.
+    """Estimate measurement noise and process noise along the axes.
 
     Parameters
     ----------
     comparison : Comparison
     names : tuple of str, optional
-        Axis names and "horizontal"; default: all.
+        Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
         Called with the name of each estimate before it is computed.
     cache : dict, optional
@@ -157,11 +157,11 @@ def estimate_noises_and_clock(
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Estimate the noises and the time offset between positions and IMU.
+    """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`tuned`.
     """
-    signal_cache: SignalCache = {}  # noises and time offset use the same IMU signals
+    signal_cache: SignalCache = {}  # both estimates use the same IMU signals
     tuning = tuned(comparison, names, progress, signal_cache)
     if slow_imu := missing_imu_rate(comparison.flight):
         return tuning, slow_imu
@@ -211,7 +211,7 @@ def _fit_source_errors(
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
-    """Fit biases, scale and jumps, and then the time correlation of the remaining errors."""
+    """Fit biases, scale factor and jumps, then the time correlation of the remaining errors."""
     horizontal = _horizontal_axes(comparison, tuning)
     if isinstance(horizontal, Unavailable):
         return horizontal, horizontal, horizontal
@@ -230,7 +230,7 @@ def _fit_source_errors(
         announced_s=reset_times_s(comparison.source).tolist(),
     )
     jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
-    # the exact time of a jump is unknown, so measurements just after the jump are excluded
+    # the exact time of a jump is unknown: exclude measurements just after the jump
     time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
@@ -259,15 +259,15 @@ def _fit_source_errors(
 def _horizontal_axes(
     comparison: Comparison, tuning: Tuning
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
-    """Return the horizontal axes with a noise estimate, and the estimate."""
+    """Return the horizontal axes that have a noise estimate, with this estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
             return tuple(comparison.axes[axis].axis for axis in axis_names), axis_tuning
     return Unavailable(
-        "causes other than noise",
-        "the noises along the horizontal axes could not be estimated",
-        "Analyse the axes north and east, or the axis aisle (--axis).",
+        "errors of the position source other than noise",
+        "the position and acceleration noise of the horizontal axes could not be estimated",
+        "Analyse the axes north and east, or the main axis (--axis aisle).",
     )
 
 
@@ -289,19 +289,23 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        rate_note = f"telemetry contains only a part of the IMU samples ({rate_hz:.3g} Hz)"
+        rate_note = f"telemetry contains only some of the IMU samples ({rate_hz:.3g} Hz)"
         remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of this flight as argument LOG."
-    return Unavailable("clock offset", f"{rate_note}; at least {needed_hz:g} Hz are needed", remedy)
+    return Unavailable(
+        "clock offset",
+        f"{rate_note}, but an estimate of the time offset needs {needed_hz:g} Hz",
+        remedy,
+    )
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
-    """Widen the interval of a time offset, because the source may drift.
+    """Widen the 95 % interval of a time offset, because the source may drift.
 
-    Scale errors, heading errors and drift of odometry change the estimated offset of each part of
-    the flight by more than the noise, so their scatter widens the interval. The time offset changes
-    in flight only if it has a significant step of at least ``MIN_CHANGE_S``.
+    Scale errors, heading errors and drift of odometry change the time offset estimates of different
+    flight phases by more than noise, so the scatter of these estimates widens the interval. A
+    change of the time offset in flight needs a significant step of at least ``MIN_CHANGE_S``.
     """
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
@@ -314,8 +318,8 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
         reason = (
-            "the time offset differs between parts of the flight by more than noise, as for "
-            f"a drifting source: possible range {low:+.2f} s to {high:+.2f} s"
+            "the time offset estimates of different flight phases differ by more than noise, as "
+            f"with a drifting source: 95 % {low:+.2f} s to {high:+.2f} s"
         )
     return structs.replace(
         clock,
@@ -334,7 +338,7 @@ def _weighted_square_sum(offset: Array, weight: Array) -> float:
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """Return the p-value of the largest change of the time offset in flight, if known.
+    """Return the p-value of the largest change of the time offset in flight, if enough estimates.
 
     Student's t-test of the weighted mean offsets before and after each tested time. The p-value is
     multiplied by the number of tests (Bonferroni), and 1 for changes below ``MIN_CHANGE_S``.

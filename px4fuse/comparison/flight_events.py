@@ -11,15 +11,15 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, FlightMode, Unavailable
 
-# Minimum length of a gap in the position source, in s and in intervals of the source; jitter and
-# single lost positions are shorter
+# Minimum length of a gap in the position source, in seconds and in sample intervals: jitter and
+# single lost positions cause shorter gaps
 MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 5.0
 
 
 @dataclass(frozen=True)
 class Events:
-    """Events of a flight, also before and after the segment (times in s since the first data).
+    """Events of a flight, also before and after the analysed time span (s since the first data).
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Events:
 
 
 def max_interval_s(interval_s: float) -> float:
-    """Return the longest time (s) between positions that is not a gap."""
+    """Return the maximum time (s) between two positions without a gap; larger times are gaps."""
     return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 

@@ -34,8 +34,8 @@ FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
     """Errors of one filter against ground truth, at the times of EKF2's published state.
 
-    The mean NEES is per axis (expected 1), and None without a variance or true velocity. It has no
-    chi-square band, because the errors of one flight are correlated.
+    The mean NEES is of one axis (expected 1), and None without a reported variance or a true
+    velocity. It has no chi-square band, because the errors of one flight are correlated.
     """
 
     count: Count
@@ -58,9 +58,9 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
     Attributes
     ----------
     sigma_p_median_m, sigma_v_median_m_s : float or None
-        Median reported σ over the segment; None if not logged.
+        Median reported σ of position and velocity; None if not logged.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
-        Median reported σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
+        Median reported position σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
     truth : ErrorsAgainstTruth or Unavailable
     """
 
@@ -96,7 +96,7 @@ class Difference(Record, frozen=True, kw_only=True):
 class Updates(Record, frozen=True, kw_only=True):
     """Number and times of KF's updates along one axis.
 
-    ``input_gap_s`` is the time (s) without IMU samples.
+    ``input_gap_s`` is the total time (s) without IMU samples.
     """
 
     count: Count
@@ -116,7 +116,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        Origin of the direction, for the user.
+        Origin of the axis direction, as text for the user.
     updates : Updates
     filters : mapping from "kf" and "ekf2" to FilterSummary or UntestedFilter
     difference : Difference or Unavailable
@@ -141,16 +141,16 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
     axis : Axis
     replay : Replay
     ekf2_state : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment, without the removed resets.
+        ``position_m, velocity_m_s`` in the segment, without resets that move EKF2's frame.
     ekf2_variance : DataFrame or Unavailable
         ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
     ekf2_innovations : DataFrame or Unavailable
-        Columns as :attr:`Ekf2.innovations`, in the segment, plus ``prior_variance_m2`` and
+        Columns of :attr:`Ekf2.innovations`, in the segment, with ``prior_variance_m2`` and
         ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
     truth : DataFrame or Unavailable
         ``position_m, velocity_m_s`` in the segment.
     flight_tracks : mapping from "ekf2_state", "ekf2_variance" and "truth" to their values
-        As above, but also in flight before and after the segment.
+        The same tracks, but also in flight before and after the segment.
     """
 
     schema_type = AxisResult
@@ -166,7 +166,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def in_flight(self) -> "AxisComparison":
-        """Comparison with tracks of the whole flight, for plots."""
+        """Same comparison with the tracks of the whole flight, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 
@@ -181,7 +181,7 @@ class Comparison:
     source_reason : str
     segment : Segment
     settings : Settings
-        Settings as used: ``input`` is "zero" if the log has no acceleration.
+        Settings of KF as used: ``input`` is "zero" if the log has no acceleration.
     lines : tuple of Axis
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
@@ -189,9 +189,9 @@ class Comparison:
     axes : mapping from axis name to AxisComparison
         Empty before the filters run.
     horizontal : mapping from "kf" and "ekf2" to HorizontalNis
-        North and east together; empty if one of them was not analysed.
+        NIS of north and east together; empty if north or east was not analysed.
     convention : Convention or None
-        Axes, unit, clock and orientation of the source as sent; ``source`` is without their faults.
+        Axes, unit, clock and orientation of the source as sent; ``source`` is corrected for them.
     """
 
     flight: Flight
@@ -218,14 +218,14 @@ class Comparison:
         """
         if axis not in self.axes:
             raise MissingDataError(
-                f"Axis {axis!r} was not analysed.",
+                f"The axis {axis!r} was not analysed.",
                 f"{suggest_name(axis, self.axes)}Available axes: {', '.join(self.axes)}.",
             )
         return self.axes[axis]
 
     @property
     def main(self) -> AxisComparison:
-        """Result along the main axis: the aisle, else the first axis."""
+        """Result along the main axis (direction of largest motion), else along the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 

@@ -11,16 +11,16 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS of both axes for separate noise estimates, which take time
+# Minimum ratio of the mean NIS along north and east for separate noise estimates, which take time
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of parts into which a flight is divided
+# Maximum number of time spans into which a flight is divided to find a noisy one
 MAX_PARTS = 12
-# Minimum number of measurements in each part of a flight
+# Minimum number of measurements in each time span into which a flight is divided
 MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):
-    """Part of the flight with larger innovations: times (s), and σ relative to the rest."""
+    """Time span (s) with larger innovations; ``ratio`` is their σ relative to the other times."""
 
     start_s: float
     end_s: float
@@ -29,7 +29,7 @@ class NoisyPart(NamedTuple):
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
-    """Estimate separate noises along north and east, if their mean NIS differ."""
+    """Estimate separate noises along north and along east, if their mean NIS differs."""
     axes = north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
     nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
@@ -46,14 +46,14 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def find_noisy_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
-    """Find one part of the flight in which most innovations are larger.
+    """Find one time span of the flight in which most innovations are larger.
 
     ``axis_tuning`` is the noise estimate of both horizontal axes.
     """
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # noise estimates are unavailable if a third of the measurements resemble outliers
+    # without noise estimates (a third of the measurements resemble outliers) use the settings of KF
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
@@ -71,13 +71,13 @@ def find_noisy_part(
     edges = np.linspace(0, len(time), count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
-        # wrong noises change the size of innovations along the flight, so estimated noises are used
+        # wrong noise settings would change the size of innovations along the flight
         axis_innovations = [
             innovations(increments, sigma_a, sigma_z, is_excluded)
             for increments in increments_by_axis
         ]
         normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # dividing by the median of each axis removes the effect of unequal axes
+        # the median of each axis removes the difference between the axes
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
     sizes = relative_innovations(None)
@@ -86,7 +86,7 @@ def find_noisy_part(
     first_part = int(np.argmax(is_noisy))
     end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
     if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
-        return None  # the noisy parts are not one contiguous time
+        return None  # the noisy time spans are not contiguous
     is_quiet = np.ones(len(time), bool)
     is_quiet[edges[first_part] : edges[end_part]] = False
     ratios = (

@@ -36,23 +36,23 @@ from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Origins of position sources, by PX4 topic or MAVLink message
+# Origin of each position source, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
-    "KF uses the only ground truth of the log as its position source",
-    "Choose another --position-source, then this source is the ground truth.",
+    "KF uses the only ground truth in the log as its position source",
+    "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS. Down is not included: GNSS height is much noisier, and SIGMA_Z is one
-# number for all axes
+# Default axes for GNSS, without down: GNSS height is much noisier, and all axes have the same
+# SIGMA_Z
 GNSS_AXES = (AISLE, "north", "east")
 
 
 def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
     """Choose position source, segment and axes of a flight.
 
-    ``as_sent`` leaves out the check of the source's axes, unit and clock, and its corrections.
+    With ``as_sent``, axes, unit and clock of the source are neither checked nor corrected.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         sigma_z_m=SIGMA_Z_M if request.sigma_z_m is None else request.sigma_z_m,
         dt_s=request.dt_s,
         input=request.input or "imu",
-        # for a position file, align_position_file has already applied the time offset
+        # align_position_file has already applied the time offset of a position file
         clock_offset_s=clock_offset_s
         if isinstance(clock_offset_s, float) and request.position is None
         else 0.0,
@@ -82,7 +82,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     track = shift_clock(track, settings.clock_offset_s)
     is_in_ned = track.origin.is_gnss or track.origin.path == "aligned by EKF2"
     convention = None if as_sent or is_in_ned else check_convention(flight, track)
-    if convention is not None and settings.clock_offset_s:  # a chosen time offset is not changed
+    if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s
     settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
@@ -108,9 +108,11 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if request.input == "imu":
-            raise SettingsError(f"{flight.log.name}: `input` imu is not possible: {acceleration}")
+            raise SettingsError(
+                f"{flight.log.name}: `input` imu needs acceleration: {acceleration}"
+            )
         settings = replace(settings, input="zero")
-        notes += (f"no acceleration input ({acceleration.reason}): KF assumes constant velocity",)
+        notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
     return Comparison(
         flight, track, reason, segment, settings, lines, notes, missing, convention=convention
@@ -118,10 +120,10 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Select EKF2's innovations of the source: GNSS or external vision."""
+    """Select EKF2's innovations of the position source: GNSS or external vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # missing innovations of external vision and missing other sources are not relevant with GNSS
+    # with GNSS, missing innovations of external vision and missing other sources are irrelevant
     missing_vision, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
@@ -145,7 +147,8 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     ----------
     flight : Flight
     name : str, optional
-        Name of a position track; default: the most direct one, GNSS only if EKF2 fused it.
+        Name of a position track. Default: the track with the fewest conversions before logging,
+        GNSS only if EKF2 fused it.
 
     Returns
     -------
@@ -171,7 +174,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
-        f"{suggest_name(name, names)}Sources in this log: {', '.join(names) or 'none'}.",
+        f"{suggest_name(name, names)}Position sources in this log: {', '.join(names) or 'none'}.",
     )
 
 
@@ -188,9 +191,8 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     samples[Columns.POSITION] -= lever_arm_ned
     forward, right, down = track.lever_arm_m
     note = (
-        "positions refer to the vehicle's origin: lever arm of the sensor "
-        f"{forward:g} m forward, {right:g} m right, {down:g} m down (EKF2 "
-        "parameters)"
+        "positions converted from the sensor to the vehicle's origin by the lever arm "
+        f"{forward:g} m forward, {right:g} m right, {down:g} m down (from EKF2 parameters)"
     )
     return replace(track, samples=samples, notes=(*track.notes, note))
 
@@ -214,7 +216,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
     north, east, down = offset_m
     note = (
         f"the median offset of {track.name} from EKF2 ({north:.1f} m north, {east:.1f} m east, "
-        f"{down:.1f} m down) is removed, because EKF2 estimates it while it fuses GNSS"
+        f"{down:.1f} m down) is removed: EKF2 estimates this offset while it fuses GNSS"
     )
     return replace(track, samples=samples, notes=(*track.notes, note))
 
@@ -222,7 +224,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Use the barometer height, if it was requested or EKF2 fused it.
+    """Use the barometer height instead of GNSS height, if requested or if EKF2 fused the barometer.
 
     A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
@@ -247,7 +249,7 @@ def _use_barometer_height(
         if np.isfinite(ekf2_down_m).any():
             zero_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
         zero_text = "the median of EKF2's height"
-    note = f"the down axis uses the barometer, with its zero set to {zero_text}"
+    note = f"the positions along down are barometer heights; zero is {zero_text}"
     return replace(
         track,
         barometer=heights - zero_m,
@@ -282,9 +284,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
 
 def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin == POSITION_FILE:
-        return "given with --position"
+        return "position file given with --position"
     if track.origin.fused_as_gnss:
-        return "fused by EKF2; the only position in the log"
+        return "the only position source in the log, fused by EKF2"
     origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     better_sources = [
         missing.source
@@ -293,8 +295,11 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         and LOGGED_ORIGINS[missing.source].preference < track.origin.preference
     ]
     if not better_sources:
-        return f"most direct source: as received by PX4{origin_text}"
-    return f"most direct source in this log{origin_text}; not usable: {', '.join(better_sources)}"
+        return f"most direct position source: as received by PX4{origin_text}"
+    return (
+        f"most direct position source in this log{origin_text}; not usable: "
+        f"{', '.join(better_sources)}"
+    )
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -311,7 +316,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the time span to analyse: positions available and vehicle airborne.
+    """Choose the time span to analyse: by default, positions available and vehicle airborne.
 
     Parameters
     ----------
@@ -329,13 +334,13 @@ def choose_segment(
     first_s, last_s = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
     low, high = first_s, last_s
     if isinstance(flight.airborne, Unavailable):
-        reason = "whole duration of the source (no land detector in the log)"
+        reason = "whole duration of the position source (no land detector in the log)"
     elif not flight.airborne:
-        reason = "whole duration of the source (the vehicle never took off)"
+        reason = "whole duration of the position source (the vehicle never took off)"
     else:
         flights = join_flights(flight.airborne)
         low, high = max(flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s))
-        reason = "source available and vehicle airborne"
+        reason = "positions available and vehicle airborne"
         if len(flights) > 1:
             others = ", ".join(
                 f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
@@ -345,7 +350,7 @@ def choose_segment(
             reason += f"; longest of {len(flights)} flights, the others are {others}"
         if not max(low, first_s) < min(high, last_s):
             low, high = min(low, first_s), max(high, last_s)
-            reason = "whole duration of the source (no positions in flight)"
+            reason = "whole duration of the position source (no positions in flight)"
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         options = {"--start": start_s, "--end": end_s}
@@ -353,7 +358,7 @@ def choose_segment(
         clipped_s = max(low, 0.0), min(high, flight.log.duration_s)
         if clipped_s != (low, high) and clipped_s[0] < clipped_s[1]:
             low, high = clipped_s
-            reason += ", cut at the ends of the data"
+            reason += ", limited to the logged time"
     if not low < high:
         raise SettingsError(
             f"{flight.log.name}: no positions between {low:.6g} s and {high:.6g} s; the position "

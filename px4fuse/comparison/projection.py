@@ -23,37 +23,36 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# EKF2's factor from GNSS position noise to height noise, in σ (gnss_height_control.cpp)
+# EKF2's ratio of GNSS height noise to GNSS position noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
-# Minimum number of common samples of two tracks for statistics of their difference
+# Minimum number of common samples of filter and ground truth, or of KF and EKF2, for statistics
 MIN_COMMON_SAMPLES = 3
-# NED columns of each projected quantity, and the power of the direction that weights them
+# NED columns of each projected quantity, and power of the direction cosines as weights
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Maximum ratio of the median squared distances to the measurements, without and with EKF2's
-# position resets, for the resets to be removed
+# Maximum ratio of EKF2's median squared distance to the measurements, without resets to with
+# resets, for resets to be removed
 MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
-    """Remove the resets of EKF2 that move the origin of its frame.
+    """Remove the resets that move the origin of EKF2's frame from its state.
 
-    A reset that changes EKF2's frame must be removed before positions are compared. A reset that
-    moves EKF2 back to the measurements corrects an error and is kept. Resets change the frame if
-    their removal clearly reduces the median distance to the measurements.
+    Other resets correct an error of EKF2 and remain in its state. Resets move the origin if their
+    removal clearly reduces the median distance of EKF2's position from the measurements.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Clause on removed and kept resets; empty without a reset in the segment.
+        Sentence part about removed and other resets; empty without a reset in the segment.
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
@@ -73,7 +72,7 @@ def continuous_state(
         if not resets:
             continue
         reset_texts = kept_resets
-        if quantity == "position":  # a velocity does not depend on the frame's origin
+        if quantity == "position":  # velocities do not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             best_state = min(
                 _continuous_candidates(ekf2.state[columns], resets, axes),
@@ -86,20 +85,25 @@ def continuous_state(
         reset_texts.append(f"{len(resets)} of {label}")
     statements = []
     if removed_resets:
-        statements.append(f"resets removed: {', '.join(removed_resets)} (they change the frame)")
+        statements.append(
+            f"EKF2 resets removed: {', '.join(removed_resets)} (they move the origin)"
+        )
     if kept_resets:
-        statements.append(f"resets kept: {', '.join(kept_resets)} (they correct an error)")
+        statements.append(
+            f"EKF2 resets not removed: {', '.join(kept_resets)} (they correct an error)"
+        )
     return state, "; ".join(statements)
 
 
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, in each of the frames between the resets."""
+    """Yield EKF2's position without resets, in the frame of each time span between resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # in the frame of this time span: add the resets before it, subtract those after it
+        # convert to the frame of one time span between resets: add earlier resets, subtract later
+        # ones
         shift_m = (~is_after[:, :earlier_count]) @ deltas[:earlier_count] - is_after[
             :, earlier_count:
         ] @ deltas[earlier_count:]
@@ -124,15 +128,18 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     return pd.DataFrame(projected, index=rows.index)
 
 
+def _no_samples(what: str) -> Unavailable:
+    reason = f"the log contains no {what} in the analysed time span"
+    return Unavailable(what, reason, "Analyse a longer time span.")
+
+
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto an axis, without covariances, which are not logged."""
+    """Project EKF2's variances onto an axis, without the covariances, which PX4 does not log."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return Unavailable(
-            "EKF2 variances", "no samples in the segment", "Analyse a longer segment."
-        )
+        return _no_samples("EKF2 variances")
     return projected
 
 
@@ -182,13 +189,13 @@ def project_innovations(
 ) -> pd.DataFrame | Unavailable:
     """Project EKF2's innovations onto an axis, with its variance before and after each update.
 
-    Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
-    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected), NaN if R is unknown.
+    Return the columns of :attr:`Ekf2.innovations`, with ``prior_variance_m2`` (P⁻ = S - R) and
+    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected), both NaN if R is unknown.
     """
     if track.aid(axis.name) is None:
         return Unavailable(
             "EKF2 innovations",
-            f"EKF2 never fuses {track.name}; the logged innovations belong to another source",
+            f"EKF2 never fuses {track.name}, so its logged innovations are of another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
     frames = []
@@ -200,9 +207,7 @@ def project_innovations(
     if axis.name == AISLE:
         rows = _innovations_along(rows, frames[1], axis.direction)
     if rows.empty:
-        return Unavailable(
-            "EKF2 innovations", "no samples in the segment", "Analyse a longer segment."
-        )
+        return _no_samples("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(
         observation_variance(flight, track, axis, segment)
     )
@@ -212,7 +217,7 @@ def project_innovations(
     )
     rows["observation_variance_m2"] = noise_variance
     rows["prior_variance_m2"] = prior_variance
-    # a rejected position does not change P
+    # EKF2 does not change P if it rejects a position
     rows["posterior_variance_m2"] = (prior_variance * noise_variance / innovation_variance).where(
         ~(rows["rejected"] > 0), prior_variance
     )
@@ -221,13 +226,13 @@ def project_innovations(
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
     common = north.index.intersection(east.index)
-    n, e = north.loc[common], east.loc[common]
-    c, s = float(direction[0]), float(direction[1])
-    projected = c * c * n + s * s * e  # variances; the other columns are replaced below
-    projected["innovation_m"] = c * n["innovation_m"] + s * e["innovation_m"]
+    north, east = north.loc[common], east.loc[common]
+    cosine, sine = float(direction[0]), float(direction[1])
+    projected = cosine * cosine * north + sine * sine * east  # for variances; other columns follow
+    projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
-        # the larger value of both axes, because EKF2 fuses and rejects both together
-        projected[column] = np.fmax(n[column], e[column])
+        # EKF2 fuses or rejects both axes together: take the larger value
+        projected[column] = np.fmax(north[column], east[column])
     return projected
 
 
@@ -254,14 +259,14 @@ def observation_variance(
     if aid is None or math.isnan(noise_m):
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
-    r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
+    configured_m2 = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # EKF2 did not receive the variance in a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
-        return r
+        return configured_m2
     reported = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
-    reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
-    return max(r, reported_along)
+    reported_m2 = float(np.nansum(reported.to_numpy() * axis.direction**2))
+    return max(configured_m2, reported_m2)
 
 
 def project_truth(
@@ -272,9 +277,5 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "ground truth",
-            f"{truth.name} has no samples in the segment",
-            "Analyse a longer segment.",
-        )
+        return _no_samples("ground truth")
     return projected

@@ -1,4 +1,4 @@
-"""Re-runs of a filter along the main axis with a change, and the statistics that they improve."""
+"""Re-runs of a filter along one axis with a change, and the statistics that a re-run improves."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,36 +12,36 @@ from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that re-runs try to bring inside their limits
+# Statistics of a filter that re-runs try to bring inside their limits
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
-# Keys of Trial.change that are neither settings of KF nor EKF2 parameters
+# Keys of Trial.change that are not EKF2 parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum mean NEES for errors larger than the reported σ: 2 σ; flights without a fault have less
-# than 3
+# Minimum mean NEES for a position error larger than the reported σ (2 σ): without a fault it is
+# below 3
 MIN_NEES_FINDING = 4.0
-# Maximum mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+# Maximum mean NEES of a re-run with a smaller noise, if the mean NEES as flown is above 1
 MAX_NEES_AFTER_CHANGE = 2.0
-# Maximum distance from 1 of the explained fraction of a cause: it explains at least half
+# Maximum distance of explained_fraction from 1 for a cause, which explains at least half
 MAX_CAUSE_DISTANCE = 0.5
-# Maximum distance from 1 of the explained fraction of a sensor fault that is the only cause: the
+# Maximum distance of explained_fraction from 1 for a sensor fault that is the only cause: the
 # noises of the re-run are approximate
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Maximum distance from 1 of the explained fraction of a change that is combined with another one
+# Maximum distance of explained_fraction from 1 for a change to be combined with another one
 MAX_HELPFUL_DISTANCE = 0.9
-# Changes that correct a sensor fault; they are preferred to changes of settings
+# Keys of changes that correct a sensor fault, which are preferred to changes of settings
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# Changes that another change requires; they are not counted
+# Keys of changes that another change requires, so find_cause does not count them
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
-# Minimum factor on a σ ratio for a re-run with an effect
+# Minimum factor by which a re-run with an effect changes a σ ratio
 MIN_RATIO_CHANGE = 1.10
-# Minimum relative change of the position RMSE for a re-run with an effect
+# Minimum relative change of the position RMSE by a re-run with an effect
 MIN_RMSE_CHANGE = 0.05
-# Minimum relative reduction of the position RMSE for a re-run that improves the position
+# Minimum relative reduction of the position RMSE by a re-run that improves the position
 POSITION_IMPROVEMENT = 0.20
-# Maximum ratio of ln(error ÷ σ) after and before a re-run that corrects the error
+# Maximum ratio of ln(error ÷ σ), with the change to as flown, for a change that corrects the error
 MAX_ERROR_LEFT = 0.75
 
 
@@ -53,9 +53,9 @@ class RunStatistics(Record, frozen=True, kw_only=True):
     innovations : int
     nis_mean : float or None
     position_rmse_m, nees_mean : float or None
-        Against ground truth, at the times of EKF2's published state.
+        Statistics against ground truth, at the times of EKF2's published state.
     difference_rms_m : float or None
-        RMS of KF - EKF2 in position.
+        RMS position difference KF - EKF2.
     rejected_fraction : float or None
         Fraction of positions that EKF2 rejected; None for KF, which has no gate.
     """
@@ -90,11 +90,11 @@ class Trial(Record, frozen=True, kw_only=True):
         from above), ``outliers_left_out`` (number), and the removed accelerometer biases
         ``bias_forward_m_s2`` and ``bias_right_m_s2``.
     discrepancies : tuple of {"nis", "nees"}
-        Statistics outside their limits that the change may explain.
+        Statistics as flown that are outside their limits and that the change may explain.
     before : RunStatistics
-        Statistics as flown, of the same samples.
+        Statistics as flown, over the same samples as ``after``.
     is_logged : bool
-        False if ``before`` is of a replay of EKF2, because it differs from the log.
+        False if ``before`` is from a replay of EKF2, because the replay differs from the log.
     after : RunStatistics
         Statistics with the change; for EKF2 from its replay.
     from_s : float or None
@@ -113,15 +113,15 @@ class Trial(Record, frozen=True, kw_only=True):
 
     @property
     def corrects_sensor(self) -> bool:
-        """True if the change corrects a fault of a sensor, not a setting."""
+        """True if the change corrects a fault of a sensor, not a setting of a filter."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
 
 def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    Above 1 the change overshoots. For the RMS difference KF - EKF2, the fraction of the mean
-    square; 0 without a difference.
+    Above 1 the change overshoots. For the statistic "difference", return the fraction of the mean
+    square difference KF - EKF2 that the change removes. Return 0 if a value is missing or zero.
     """
     before, after = trial.before.value(statistic), trial.after.value(statistic)
     if not before or not after:
@@ -138,7 +138,7 @@ def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
 
 
 def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
-    """Return True if the change makes σ smaller than the errors against ground truth."""
+    """Return True if the change reduces the reported σ below the errors against ground truth."""
     nees, nis, nees_after = trial.before.nees_mean, trial.before.nis_mean, trial.after.nees_mean
     if statistic != "nis" or nis is None or nis >= 1.0 or nees_after is None:
         return False
@@ -148,7 +148,7 @@ def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return the re-runs that may explain a mean NIS or mean NEES outside its limits."""
+    """Return the re-runs of a filter along an axis whose change may explain a discrepancy."""
     return [
         trial
         for trial in trials
@@ -159,10 +159,11 @@ def find_trials(
 def find_cause(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Trial | None:
-    """Return the re-run that best explains a mean NIS or mean NEES outside its limits.
+    """Return the re-run whose change best explains a mean NIS or mean NEES outside its limits.
 
-    A cause explains 50 to 150 % of the logarithm and does not contradict ground truth. Preferred
-    are, in this order, complete causes, fewer changes, sensor faults, and fractions near 1.
+    A cause has an :func:`explained_fraction` of 50 to 150 % and does not contradict ground truth.
+    Preferred are, in this order, sufficient causes, fewer changes, sensor faults, and fractions
+    near 1.
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
@@ -185,7 +186,7 @@ def find_cause(
 
 
 def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs that explain a part of a discrepancy, best first.
+    """Return the re-runs whose change explains a fraction of a discrepancy, best first.
 
     The list is empty if one of the changes is sufficient.
     """
@@ -211,7 +212,7 @@ def distance_from_one(outcome: RunStatistics) -> float:
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
-    """Return a sort key for re-runs of the same kind; the best one has the smallest key."""
+    """Return a sort key for re-runs of one kind of change: the best re-run has the smallest key."""
     enters = enters_band(trial)
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
@@ -226,12 +227,12 @@ def ratios(outcome: RunStatistics) -> dict[Reference, float]:
 
 
 def reduction(trial: Trial) -> float:
-    """Return the decrease of :func:`distance_from_one` by a re-run."""
+    """Return the decrease of the sum of |ln σ ratio| (:func:`distance_from_one`) by a re-run."""
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
 def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return the reference and the σ ratios before and after a re-run, for each reference."""
+    """Return (reference, σ ratio as flown, σ ratio with the change) for source and ground truth."""
     before, after = ratios(trial.before), ratios(trial.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
@@ -254,7 +255,7 @@ def halves(trial: Trial) -> bool:
 
 
 def leaves_error(trial: Trial) -> bool:
-    """Return True if a filter remains nearly as overconfident against ground truth."""
+    """Return True if a filter remains nearly as overconfident against ground truth as flown."""
     return any(
         name == "truth"
         and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
@@ -275,7 +276,7 @@ def find_trial(
     kind : str
         See :attr:`Trial.kinds`.
     name : str
-        Setting or parameter that the change contains; empty for any.
+        Setting or EKF2 parameter that the change contains; an empty text allows any.
     """
     return min(
         (

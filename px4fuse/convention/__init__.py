@@ -1,1 +1,1 @@
-"""Check of a position source's convention: axes, unit, clock and orientation."""
+"""Check of the convention of a position source: axes, length unit, clock and orientation."""

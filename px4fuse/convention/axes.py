@@ -1,14 +1,16 @@
-"""Maximum-likelihood search of the map from the positions of a source to north, east and down.
+"""Maximum-likelihood search for the convention of positions: axes, unit, rotation and delay.
 
-A hypothesis consists of axes (48 signed permutations, mirrored ones included), a rotation about the
-vertical, a unit and a time offset, usually up to 10 s. For one time offset, all hypotheses
-follow from one 3×3 matrix of moments: with w = D_a ± i D_b of the source and n = A_north + i A_east
-of the IMU, the best rotation is the angle of Σ conj(w) n. The best hypotheses are refined together
-with an accelerometer bias (body) and, with the heading of the gyro, its linear drift.
+A hypothesis maps the positions to north, east and down. It consists of axes (48 signed
+permutations, mirrored ones included), a rotation about the vertical, a length unit and a time
+offset (usually up to 10 s). For one time offset, all hypotheses are scored from one 3×3 matrix of
+moments: with w = D_a ± i D_b of the source and n = A_north + i A_east of the IMU, the best rotation
+is the angle of Σ conj(w) n. The best hypotheses are refined together with an accelerometer bias in
+the body frame and, with the heading integrated from the gyroscopes, its linear drift.
 
 Residuals (m) have a Student distribution with ``FREEDOM`` degrees of freedom, with one scale for
-north and east and one for down. The log likelihood is relative to positions without relation to the
-motion, and contains the Jacobian of the unit: small units make residuals small.
+north and east and one for down. The log likelihood is relative to positions that are unrelated to
+the motion measured by the IMU. It contains the Jacobian of the unit, because small units make
+residuals small.
 """
 
 from collections.abc import Mapping
@@ -24,48 +26,48 @@ from px4fuse.core.arrays import Array, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_OFFSET_S = 10.0
-# Minimum common time (s) of positions and IMU
+# Minimum time (s) with both positions and IMU data for a hypothesis to be scored
 MIN_OVERLAP_S = 10.0
-# Minimum scale (m) of the horizontal residuals: IMU noise, tilt and interpolation over T
+# Minimum scale (m) of the horizontal residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_M = 0.05
-# Minimum scale (m) of the vertical residuals
+# Minimum scale (m) of the vertical residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 FREEDOM = 4.0
-# Length units in metres
+# Size of each length unit in metres
 UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Maximum rotation (rad) that is not a different convention
+# Maximum rotation (rad) of the frame about the vertical that is not a different convention
 SMALL_ROTATION = np.radians(8.0)
-# Maximum time offset (s) without a lower prior
+# Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
-# Log prior odds of a rotated frame
+# Log prior odds of a frame that is rotated by more than SMALL_ROTATION
 ROTATION_ODDS = -1.0
 # Log prior odds of a time offset above SMALL_OFFSET_S
 OFFSET_ODDS = -2.0
 # Log prior odds of a unit other than metres
 UNIT_ODDS = -2.0
-# Standard deviation (m) of barometer heights
+# Standard deviation (m) of barometer heights in the likelihood
 BAROMETER_SIGMA_M = 0.5
-# Number of independent barometer heights in the likelihood
+# Number of independent barometer heights that the likelihood assumes
 BAROMETER_WEIGHT = 6.0
-# Maximum number of hypotheses of the coarse search that are refined
+# Maximum number of hypotheses from the search on a grid that are refined
 MAX_REFINED = 8
-# Maximum log likelihood ratio of the best hypothesis to another one that is refined
+# Maximum log likelihood ratio of the best hypothesis to another hypothesis, to refine the other one
 MAX_DEFICIT = 60.0
-# Maximum number of samples in the refinement
+# Maximum number of second differences used to refine a hypothesis
 MAX_ROWS = 1200
-# Number of Gauss-Newton steps
+# Number of Gauss-Newton iterations to refine a hypothesis
 ITERATIONS = 7
-# Maximum change (s) of the time offset in one Gauss-Newton step
+# Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_STEP_S = 0.15
-# Prior precision of Hypothesis.parameters: gyro heading drift (σ 0.05 °/s), accelerometer bias (σ
-# 0.3 m/s²)
+# Prior precision (σ⁻²) of Hypothesis.parameters: heading drift of the gyroscopes (σ 0.05 °/s),
+# accelerometer bias (σ 0.3 m/s²)
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of the axes x, y, z. Left-handed frames have one wrong sign, or x and y exchanged
+# Log prior odds of the directions of x, y, z. Left-handed ones: a wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
-    ("north", "east", "down"): 1.0,  # as stated
+    ("north", "east", "down"): 1.0,  # convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
     ("north", "east", "up"): -2.5,
@@ -75,9 +77,10 @@ AXES_ODDS: Final[dict[Axes, float]] = {
 
 
 class Family(NamedTuple):
-    """Assignment of the axes x, y, z: the vertical one with its sign, and both horizontal ones.
+    """Assignment of the axes x, y, z: indices of the vertical axis and of both horizontal axes.
 
-    ``sign`` is 1 if the vertical axis points down, ``hand`` is 1 if b is clockwise from a.
+    ``sign`` is 1 if the vertical axis points down. ``hand`` is 1 if the horizontal axis ``b`` is
+    clockwise from the horizontal axis ``a``.
     """
 
     vertical: int
@@ -92,7 +95,7 @@ class Family(NamedTuple):
         return (self.sign * self.hand < 0) != (self.vertical == 1)
 
     def axes(self, quarter: int) -> Axes:
-        """Return the directions of x, y, z if axis a points to ``CLOCKWISE[quarter]``."""
+        """Return the directions of x, y, z if the axis ``a`` points to ``CLOCKWISE[quarter]``."""
         names: list[Direction] = ["down" if self.sign > 0 else "up"] * 3
         names[self.a] = CLOCKWISE[quarter % 4]
         names[self.b] = CLOCKWISE[(quarter + self.hand) % 4]
@@ -112,7 +115,7 @@ FAMILIES = tuple(
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions of a source as sent, and barometer heights (time in s, height in m, up)."""
+    """Positions of a source as sent, and barometer data as (time in s, height in m)."""
 
     time_s: Array
     position_m: Array
@@ -120,11 +123,11 @@ class Positions:
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "Positions":
-        """Return the positions with timestamps without a clock drift."""
+        """Return the positions with timestamps corrected for a clock drift (rate minus 1)."""
         return replace(self, time_s=without_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
-        """Return the second differences of the positions, for all tested time offsets."""
+        """Return the second differences of the positions for all tested time offsets."""
         edge = round(self.max_offset_s / GRID_S)
         grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
         return SourceMotion.of(self.time_s, self.position_m, grid)
@@ -139,18 +142,19 @@ class Hypothesis:
     family : Family
     unit : str
     parameters : ndarray, shape (7,)
-        Delay of the timestamps (s); rotation of axis a from north, clockwise (rad); drift of the
-        gyro's heading (rad/s); clock drift; accelerometer bias (m/s²; forward, right, down).
+        Delay of the timestamps (s); rotation of axis ``a`` from north, clockwise (rad); drift of
+        the gyroscopes' heading (rad/s); clock drift; accelerometer bias (m/s²; forward, right,
+        down).
     score : float
-        Log likelihood relative to no relation, with log prior odds.
+        Log likelihood relative to positions unrelated to the IMU, plus log prior odds.
     has_rotation : bool
-        False for a multiple of 90°.
+        True to estimate the rotation, False to keep it at a multiple of 90°.
     has_clock_drift : bool
     scale, max_scale : float
-        Ratio of the distances in the source to those of the IMU, in addition to the unit: lower
-        limit, with IMU noise only, and upper limit, with noise of the source only.
+        Ratio of distances in the source, converted to metres, to those of the IMU: lower limit (if
+        only the IMU has noise) and upper limit (if only the source has noise).
     sigma_m : float
-        Scale of the horizontal residuals.
+        Scale (m) of the horizontal residuals.
     windows : float
         Number of independent residuals.
     heading_from : {"EKF2", "gyroscopes"}
@@ -175,12 +179,12 @@ class Hypothesis:
 
     @property
     def quarter(self) -> int:
-        """Number of quarter turns nearest to the rotation."""
+        """Number of quarter turns nearest to the rotation from north."""
         return round(float(self.parameters[1]) / (np.pi / 2.0))
 
     @property
     def axes(self) -> Axes:
-        """Directions of x, y and z, to the nearest quarter turn."""
+        """Directions of x, y and z to the nearest quarter turn, for example north, east, down."""
         return self.family.axes(self.quarter)
 
     @property
@@ -189,14 +193,14 @@ class Hypothesis:
         return float(self.parameters[1] - self.quarter * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
-        """Return True if axes, unit, rotation and time offset are similar."""
+        """Return True if another hypothesis has similar axes, unit, rotation and time offset."""
         turn_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
         is_similar = abs(self.offset_s - other.offset_s) < 0.5 and abs(turn_rad) < max_turn_rad
         return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
 
 
 def without_drift(time_s: Array, drift: float) -> Array:
-    """Remove the drift of a clock from timestamps; their mean remains."""
+    """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
     middle = float(np.mean(time_s))
     return middle + (time_s - middle) / (1.0 + drift)
 
@@ -204,7 +208,7 @@ def without_drift(time_s: Array, drift: float) -> Array:
 def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
     """Return all likely conventions of the positions, best first.
 
-    Empty without enough common time or motion.
+    The list is empty without enough motion, or enough time with positions and IMU data.
     """
     refined = []
     for heading_from, imu in motions.items():
@@ -226,7 +230,7 @@ def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> 
 def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
     """Search for likely conventions on a grid of time offsets.
 
-    For each unit and each assignment of the axes, the best time offset is returned.
+    For each unit, assignment of axes and quarter turn, only the best time offset is considered.
     """
     left = np.column_stack([source.table, source.table**2, source.is_valid])
     right = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
@@ -271,7 +275,7 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
 def refine(
     start: Hypothesis, positions: Positions, source: SourceMotion, imu: ImuMotion
 ) -> Hypothesis:
-    """Refine a hypothesis by robust least squares (Gauss-Newton)."""
+    """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
     best, parameters = replace(start, score=-np.inf), start.parameters
@@ -286,7 +290,7 @@ def refine(
 def _evaluate(
     hypothesis: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
 ) -> tuple[Hypothesis, Array]:
-    """Return a hypothesis with its log likelihood, and the next change of its parameters."""
+    """Return a hypothesis with its log likelihood, and the Gauss-Newton step of its parameters."""
     offset_s, angle, heading_drift, clock_drift = hypothesis.parameters[:4]
     bias, time_s = hypothesis.parameters[4:], source.time_s[rows]
     row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
@@ -311,7 +315,7 @@ def _evaluate(
     squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     gain, sigma_m = student_score(squares[0], 2, MIN_SIGMA_M)
     gain_down, sigma_down_m = student_score(squares[1], 1, MIN_SIGMA_DOWN_M)
-    is_known = sent.any(axis=0)  # False for a missing height
+    is_known = sent.any(axis=0)  # False for the height if the source has none
     gain += gain_down * is_known[vertical] + np.log(unit) * np.count_nonzero(is_known)
     gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
     weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
@@ -320,7 +324,7 @@ def _evaluate(
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     )
-    if 0.0 in (ned_square, product, square):  # a vehicle at rest shows no convention
+    if 0.0 in (ned_square, product, square):  # without motion the convention is unknown
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
@@ -351,7 +355,7 @@ def _evaluate(
 
 
 def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[float, float]:
-    """Return the largest mean log likelihood of a Student distribution, and its scale."""
+    """Fit a Student distribution to squared residuals; return mean log likelihood and scale."""
     variance = max(float(np.median(squares)) / (0.455, 1.386)[dimensions - 1], min_sigma**2)
     for _ in range(5):
         weight = (FREEDOM + dimensions) / (FREEDOM + squares / variance)
@@ -362,7 +366,7 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 
 def _log_odds(hypothesis: Hypothesis, positions: Positions) -> float:
-    """Return the log prior odds of a hypothesis plus the log likelihood of its heights."""
+    """Return the log prior odds of a hypothesis, plus its log likelihood of barometer heights."""
     odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
     odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:

@@ -1,4 +1,4 @@
-"""Decision on the convention of a position source, before anything is estimated from it."""
+"""Decision on the convention of a position source, before other estimates use the source."""
 
 from dataclasses import replace
 
@@ -36,30 +36,30 @@ from px4fuse.trajectory.rotation import heading
 
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
-# Minimum log likelihood ratio to positions that are unrelated to the motion
+# Minimum log likelihood ratio to positions unrelated to the motion for any decision
 MIN_GAIN = 8.0
-# Minimum log likelihood ratio for each window, for an unambiguous and for an ambiguous convention
+# Minimum log likelihood ratio per independent sample: unambiguous and ambiguous convention
 MIN_GAIN_PER_WINDOW = (0.15, 0.4)
-# Range of the ratio of distances from the source and from the IMU, for a certain convention
+# Range of the ratio of distances of the source to those of the IMU, else the result is doubtful
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# Maximum ratio of the residuals to those that source noise and IMU error explain
+# Maximum ratio of residuals to source noise and IMU error, else the result is doubtful
 MAX_RESIDUAL_RATIO = 2.4
-# Minimum position error (m) of the IMU
+# Position error (m) of the second differences of the IMU
 IMU_ERROR_M = 0.05
-# Maximum log likelihood ratio of the gyro's heading to the logged heading, for the logged one to be
-# used
+# Maximum log likelihood ratio of the gyroscopes' heading to the logged heading, to use the logged
+# one
 MAX_LOGGED_DEFICIT = 20.0
-# Minimum gain of the log likelihood for accepting a clock drift
+# Minimum gain of the log likelihood by a clock drift, to correct the drift
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Maximum fraction of repeated positions that are left out
+# Maximum fraction of repeated positions for the check to ignore them
 MAX_REPEATED_SHARE = 0.5
-# Minimum fraction of positions with a height, for the height to be used
+# Minimum fraction of positions with a height for the check to use heights
 MIN_HEIGHT_SHARE = 0.5
-# Sum of the squared coefficients of third differences
+# Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE = 20.0
-# Sum of the squared coefficients of second differences
+# Variance of second differences of white noise with variance 1
 SECOND_DIFFERENCE = 6.0
 
 
@@ -72,13 +72,13 @@ def check_convention(
     ----------
     flight : Flight
     track : PositionTrack
-        Positions as read: north, east, down by their definition.
+        Positions as read: north, east, down if the source follows PX4's convention.
     max_offset_s : float
-        Largest time offset that is tried.
+        Maximum tested time offset (s).
 
     Returns
     -------
-    Convention, or None without IMU or attitude.
+    Convention, or None without IMU data or attitude.
     """
     inertial = read_inertial(flight)
     if inertial is None:
@@ -105,7 +105,7 @@ def check_convention(
 
 
 def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
-    """Return the positions without repetitions, with height 0 if the source has none."""
+    """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
     if samples["down_m"].notna().mean() < MIN_HEIGHT_SHARE:
         samples = samples.assign(down_m=0.0)
@@ -120,9 +120,9 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
 
 
 def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
-    """Return the likely conventions with both headings, best first.
+    """Return the likely conventions with logged heading and with gyroscope heading, best first.
 
-    The logged heading is preferred if it fits nearly as well, because it refers to north.
+    The logged heading refers to north, so it is preferred if it fits nearly as well.
     """
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
@@ -137,10 +137,10 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
 
 
 def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) -> Convention:
-    """Compare the best convention with the other ones and with the noise of the source."""
+    """Decide whether the best convention is unambiguous, and its residuals explained by noise."""
     best = hypotheses[0]
     rivals = [hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best)]
-    if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
+    if not positions.position_m[:, 2].any():  # without heights, up and down fit equally well
         rivals = [hypothesis for hypothesis in rivals if hypothesis.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
@@ -189,9 +189,9 @@ def _describe(hypothesis: Hypothesis) -> str:
 
 
 def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
-    """Return the ratio of the residuals to those of source noise and IMU error.
+    """Return the ratio of the residuals to the noise of source and IMU.
 
-    The noise is estimated from third differences, which contain hardly any motion.
+    The noise of the source is estimated from third differences, which contain hardly any motion.
     """
     third = np.diff(positions.position_m, 3, axis=0)
     deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
@@ -200,7 +200,7 @@ def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
 
 
 def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
-    """Return the most likely clock drift of the sender, or 0."""
+    """Return the most likely drift of the source's clock, or 0 if it is not significant."""
     start = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
@@ -223,7 +223,7 @@ def _check_orientation(
     best: Hypothesis,
     verdict: Verdict,
 ) -> OrientationConvention | None:
-    """Check the convention of the orientation, and its heading against the positions."""
+    """Check the convention of the source's orientation, and its heading against the positions."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     checked = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
@@ -237,7 +237,7 @@ def _check_orientation(
     motion = motion_from_imu(inertial, replace_heading(inertial.gyro, own_heading))
     is_covered = (motion.time_s > time_s[0] + WINDOW_S) & (motion.time_s < time_s[-1] - WINDOW_S)
     motion = replace(motion, is_valid=motion.is_valid & is_covered)
-    # direction of the x axis of a consistent frame, clockwise from north
+    # heading (°) of the x axis of a position frame that agrees with the orientation's frame
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
     if best.family.sign > 0:
         directions_deg = [0.0]

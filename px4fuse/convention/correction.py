@@ -1,4 +1,4 @@
-"""Faults of a source's convention, and the flight and source without them."""
+"""Faults in the convention of a position source, and their correction in flight and source."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -16,39 +16,40 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) of a frame with wrong axes: the estimate of the heading error covers less
+# Minimum rotation (°) of a frame with wrong axes to be corrected here: HeadingError contains
+# smaller rotations
 MIN_REMAINDER_DEG = 8.0
-# Minimum rotation (°) of a frame that is only rotated
+# Minimum rotation (°) to be corrected here, of a frame with right axes
 MIN_ROTATION_DEG = 15.0
-# Minimum time offset (s) for a correction: the estimate of the time offset covers smaller ones
+# Minimum time offset (s) to be corrected here: ClockOffset contains smaller offsets
 MIN_LATE_S = 0.5
-# Minimum heading error (°) of an orientation relative to its own positions
+# Minimum heading error (°) of a source's orientation relative to its positions, for a fault
 MIN_HEADING_ERROR_DEG = 10.0
-# Kinds of orientation faults; empty without a fault
+# Fault of the source's orientation; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of a position source that its convention shows.
+    """Faults in the convention of a position source, compared with PX4's convention.
 
     Attributes
     ----------
     axes : bool
-        True if the axes are not those of NED, except for a rotation about the vertical.
+        True if the axes are not NED, even after a rotation about the vertical.
     rotation_deg : float
-        Rotation of the positions relative to NED, or to ENU or NWU with these axes; clockwise.
+        Clockwise rotation of the positions relative to NED; relative to ENU or NWU for such axes.
     unit : bool
     late_s, clock_drift : float
-        0 if not significant.
+        Delay of the timestamps, and rate of the source's clock minus 1; 0 if not significant.
     orientation : str
-        Fault of the orientation; "" if there is none.
+        Fault of the orientation; empty without a fault.
     affects_ekf2 : bool
-        True if EKF2 fused a faulty source, so that its attitude is wrong, too.
+        True if EKF2 fused the faulty source, so that EKF2's attitude is wrong, too.
     is_north_unknown : bool
-        True if EKF2's heading came from the source, so that the rotation is unknown.
+        True if EKF2's heading is from the source, so that the rotation from north is unknown.
     is_ambiguous : bool
-        True if other conventions than NED in metres fit equally well, but NED does not.
+        True if several conventions fit equally well, and NED in metres is not one of them.
     """
 
     axes: bool = False
@@ -63,7 +64,7 @@ class Faults:
 
     @property
     def of_positions(self) -> bool:
-        """True if the positions, their unit or their timestamps are wrong."""
+        """True if axes, rotation, unit or timestamps of the positions are wrong."""
         return bool(self.axes or self.rotation_deg or self.unit or self.late_s or self.clock_drift)
 
     def __bool__(self) -> bool:
@@ -71,7 +72,7 @@ class Faults:
 
 
 def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a source; ``frame`` is the frame that it states."""
+    """Return the faults of a position source whose stated frame is ``frame``."""
     if convention is None:
         return Faults()
     fault = _orientation_fault(convention)
@@ -87,7 +88,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
-    # if EKF2's heading came from the orientation, the positions have no reference to north
+    # if EKF2's heading is from the source's orientation, positions have no reference to north
     has_own_heading = (
         is_fused and is_drifting and convention.orientation is not None and fault != "copied"
     )
@@ -107,7 +108,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
-    """Return True for axes other than NED, and the rotation (°) of the positions."""
+    """Return True for axes other than NED, and the clockwise rotation (°) of the positions."""
     rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
     is_known = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known or convention.z not in ("up", "down"):
@@ -135,10 +136,10 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
 def correct(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
-    """Convert positions and orientation of a source to the convention of PX4.
+    """Convert positions and orientation of a position source to the convention of PX4.
 
-    If EKF2 fused a faulty source, EKF2's attitude is faulty, too. The attitude from the gyroscopes
-    replaces it.
+    If EKF2 fused the faulty source, the attitude integrated from the gyroscopes replaces EKF2's
+    attitude, which is faulty, too.
     """
     faults = find_faults(convention, flight, track.frame)
     if convention is None or not faults:
@@ -167,7 +168,8 @@ def correct(
     if inertial is None:
         return flight, track
     attitude = inertial.attitudes[convention.heading_from]
-    if not faults.axes and not faults.rotation_deg:  # the positions refer to north
+    # take north from the positions
+    if not faults.axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
     table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
@@ -175,7 +177,7 @@ def correct(
 
 
 def _matrix(convention: Convention, faults: Faults) -> Array:
-    """Return the matrix that converts the positions to NED in metres."""
+    """Return the 3×3 matrix that converts the positions to NED in metres."""
     scale = UNITS[convention.unit]
     if not faults.axes and not faults.rotation_deg:
         return scale * np.eye(3)

@@ -16,7 +16,7 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavaila
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 from px4fuse.trajectory.scores import autocorrelation_time
 
-# Minimum lever arm (m) for a finding: twice the noise of good UWB
+# Minimum lever arm (m) for a finding: twice the noise of good UWB (0.1 m)
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
 MIN_ARM_SIGMAS = 2.5
@@ -24,13 +24,13 @@ MIN_ARM_SIGMAS = 2.5
 MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS = 0.05, 5.0
 # Maximum lever arm (m) for a finding: a larger one is an error of the frame
 MAX_ARM_M = 5.0
-# Maximum residual in σ of a sample that is used
+# Maximum residual, in σ, of a sample that the next fit uses
 CLIPPED_SIGMAS = 3.0
 # Minimum ratio of the singular values of a fit with ground truth
 MIN_SINGULAR_RATIO = 0.02
 # Minimum number of measured coordinates for a fit with ground truth
 MIN_ROWS = 40
-# Number of least squares fits with outlier removal
+# Number of successive least squares fits, each without the outliers of the previous fit
 ITERATIONS = 4
 
 
@@ -104,7 +104,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
         is_used = is_used & source.is_valid
         excess = source.table - imu.table[:, :2, 0]
         rows, values = design[is_used].reshape(-1, design.shape[2]), excess[is_used].ravel()
-        # successive second differences overlap by twice the window
+        # second differences overlap over twice the window, so only these are independent
         count = len(values) * GRID_S / (2.0 * WINDOW_S)
         if count < 2 * rows.shape[1]:
             return None

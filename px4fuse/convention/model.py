@@ -1,4 +1,4 @@
-"""Records of the convention of a position source."""
+"""Records of the axes, unit, clock and orientation that a position source uses."""
 
 from typing import Literal
 
@@ -20,7 +20,7 @@ class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=Fal
     ----------
     verdict : str
         "determined" or "ambiguous"; "copied": equal to the autopilot's attitude; "unrelated": no
-        convention makes the orientation follow the vehicle.
+        convention relates the orientation to the attitude.
     order : {"w x y z", "x y z w"}
         Order of the components as sent.
     frames : str
@@ -29,7 +29,7 @@ class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=Fal
         Heading of the orientation relative to the positions, clockwise from above; None if it
         cannot be determined.
     tilt_difference_deg : float
-        Median difference from the attitude of the gyroscopes, after the conversion.
+        Median tilt difference from the gyroscopes' attitude, after conversion to FRD and NED.
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
@@ -45,16 +45,18 @@ class Convention(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     verdict : str
-        "doubtful": the best hypothesis leaves errors that no noise of the source explains.
+        "determined", "ambiguous", "not determinable", or "doubtful": the residuals of the best
+        hypothesis exceed the noise of source and IMU.
     x, y, z : str
         Directions of the axes as sent, to the nearest quarter turn about the vertical.
     unit : {"m", "cm", "mm", "feet"}
     is_mirrored : bool
         True for a left-handed frame.
     rotation_deg : float
-        Rotation of the positions beyond these axes: clockwise from above, 0 if not significant.
+        Further rotation of the positions from these axes, clockwise from above; 0 if not
+        significant.
     heading_from : {"EKF2", "gyroscopes"}
-        Heading that fits the positions: as logged, or integrated from the start of the log.
+        Heading that fits the positions: logged by EKF2, or integrated from the gyroscopes.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
@@ -62,11 +64,11 @@ class Convention(Record, frozen=True, kw_only=True):
     scale : float
         Distances of the source relative to those of the IMU, with the unit applied.
     log_odds : float or None
-        Log likelihood ratio to the best other convention (with priors); None without another.
+        Log likelihood ratio (with priors) to the second best convention; None without it.
     log_likelihood_gain : float
         Log likelihood ratio to positions without relation to the motion.
     alternatives : tuple of str
-        Other conventions that fit about as well.
+        Other conventions that fit nearly as well, as texts.
     orientation : OrientationConvention or None
     """
 

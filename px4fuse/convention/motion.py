@@ -34,20 +34,20 @@ from px4fuse.trajectory.rotation import (
 
 # Standard gravity (m/s²)
 GRAVITY_M_S2 = 9.80665
-# Time T (s) of the second differences
+# Time T (s) between the three positions of a second difference
 WINDOW_S = 2.0
-# Interval (s) between second differences
+# Sample interval (s) of the second differences
 GRID_S = 0.1
 # Integration step (s) of the IMU
 STEP_S = 0.02
 # Length (s) of the running mean that is subtracted from the second differences
 HIGH_PASS_S = 12.0
-# Length (s) of the running mean of the specific force, which defines the vertical. A symmetric mean
-# causes no delay
+# Length (s) of the running mean of the specific force that defines the vertical. The mean is
+# centred, so it causes no delay
 LEVELLING_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-# Minimum interval (s) of positions that is a gap
+# Minimum interval (s) between two positions that counts as a gap
 MIN_GAP_S = 0.35
 
 
@@ -59,12 +59,12 @@ class Inertial:
     ----------
     time_s : ndarray, shape (n + 1,)
     force_m_s2 : ndarray, shape (n, 3)
-        Mean specific force (body FRD) between the times.
+        Mean specific force in the body frame (FRD) between successive times.
     logged, gyro : ndarray, shape (n + 1, 4)
-        Attitude (w, x, y, z; FRD to NED). ``gyro`` is integrated from the gyroscopes, starting with
-        the first logged attitude; gravity corrects the tilt, nothing corrects the heading.
+        Attitude (w, x, y, z; FRD to NED) of EKF2, and integrated from the gyroscopes starting with
+        the first logged attitude. Gravity corrects the tilt of ``gyro``, not its heading.
     valid_spans_s : tuple of (float, float)
-        Spans in flight without a gap of the IMU.
+        Time spans in flight without a gap in the IMU data.
     """
 
     time_s: Array
@@ -75,7 +75,7 @@ class Inertial:
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the heading of EKF2 and with that of the gyroscopes."""
+        """Attitudes with the heading of EKF2 or of the gyroscopes, and the tilt of ``gyro``."""
         return {"EKF2": replace_heading(self.gyro, heading(self.logged)), "gyroscopes": self.gyro}
 
 
@@ -89,7 +89,7 @@ class SourceMotion:
 
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
-        """Compute the second differences of positions; valid where samples are near."""
+        """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window = round(WINDOW_S / GRID_S)
         at_s = grid_s[0] + GRID_S * np.arange(-window, len(grid_s) + window)
         is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
@@ -107,8 +107,8 @@ class ImuMotion:
     time_s : ndarray, shape (n,)
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
-        Second difference without accelerometer bias; then its change per 1 m/s² of bias forward,
-        right, down.
+        First column: second difference without accelerometer bias. Other columns: change of it per
+        1 m/s² of bias forward, right and down.
     rate_m_s : ndarray, shape (n, 3)
         Time derivative of ``table[..., 0]``.
     """
@@ -122,7 +122,7 @@ class ImuMotion:
 def read_inertial(flight: Flight) -> Inertial | None:
     """Integrate the gyroscopes of a flight to an attitude that EKF2 does not affect.
 
-    None without IMU and attitude over at least 8 s.
+    Return None if IMU data and attitude overlap for less than 8 s.
     """
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable) or isinstance(attitude, Unavailable):
@@ -149,10 +149,10 @@ def read_inertial(flight: Flight) -> Inertial | None:
 
 
 def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
-    """Integrate the angular rates without the gyro bias.
+    """Integrate the gyroscopes without their bias, from the first logged attitude.
 
-    The bias is the median difference to the logged rotation, because a reset of the logged heading
-    is an outlier.
+    The bias is the median difference to the logged rotation: a reset of the logged heading is an
+    outlier of this difference.
     """
     excess = angle_rad - to_vector(multiply(conjugate(logged[:-1]), logged[1:]))
     total = np.cumsum(excess, axis=0)
@@ -162,7 +162,7 @@ def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
 
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
-    """Correct the tilt so that the mean specific force is vertical."""
+    """Correct the tilt of an attitude: the running mean of the specific force becomes vertical."""
     mean = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
         mean = running_mean(mean, np.ones(len(mean), dtype=bool), round(LEVELLING_S / STEP_S))
@@ -172,7 +172,7 @@ def _level(attitude: Array, force_m_s2: Array) -> Array:
 
 
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
-    """Return the centred running mean of the valid rows; shorter at the ends."""
+    """Return the centred running mean over ``width`` rows, of which only valid ones count."""
     rows = np.arange(len(values))
     low, high = np.clip(rows - width // 2, 0, None), np.clip(rows + width // 2 + 1, None, len(rows))
     flat = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
@@ -184,19 +184,22 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    """Subtract the running mean; invalid rows are 0."""
+    """Subtract the running mean over HIGH_PASS_S, and set invalid rows to 0."""
     filtered = values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S))
     filtered[~is_valid] = 0.0
     return filtered
 
 
 def second_difference(position: Array, window: int) -> Array:
-    """Return p(t + T) - 2 p(t) + p(t - T), with T in samples."""
+    """Return the second difference p(t + T) - 2 p(t) + p(t - T), with T of ``window`` samples."""
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
 def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
-    """Integrate the acceleration twice, with an attitude (w, x, y, z), shape (n + 1, 4)."""
+    """Integrate the specific force twice to second differences of the position in NED.
+
+    ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED) at each time.
+    """
     middle = attitude[1:] + attitude[:-1]
     body_to_ned = to_matrix(middle / np.linalg.norm(middle, axis=1, keepdims=True))
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
@@ -207,7 +210,7 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     window, every = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
     second = second_difference(position, window)[::every]
     time_s = inertial.time_s[window:-window][::every]
-    # the land detector already excludes the ground; a gap excludes T on both sides
+    # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
         is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)

@@ -1,7 +1,8 @@
-"""Convention of an orientation: order of the quaternion, frames, constant rotation of the body.
+"""Convention of a source's orientation: order of the quaternion, frames, rotation of the body.
 
-The reference is the attitude from the gyroscopes, whose tilt follows gravity. A hypothesis is
-scored by the median difference of the tilt and of the heading, the heading about its circular mean.
+The reference is the attitude from the gyroscopes, whose tilt follows gravity. The score of
+a hypothesis depends on the median tilt difference from the reference, and on the median deviation
+of the heading difference from its circular mean.
 """
 
 from itertools import product
@@ -21,7 +22,7 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-# Quaternions of the rotations of world and body to NED and FRD, by stated frames
+# Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
 FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
     "FLU to ENU": (ENU_NED, FRD_FLU),
@@ -30,29 +31,29 @@ FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to ENU": (ENU_NED, IDENTITY),
 }
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
-# Maximum median difference (°) of a copied attitude: copies differ by 0.03°, fused motion capture
-# by more than 0.2°
+# Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused
+# motion capture by more than 0.2°
 MAX_COPY_DEG = 0.15
-# Tested delays (s) of a copied attitude
+# Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 # Maximum median tilt difference (°) of a correct convention
 MAX_TILT_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DEG = 12.0
-# Minimum difference (°) that lowers the score: noise of tilt and heading
+# Minimum tilt or heading difference (°) in the score: noise causes smaller ones
 MIN_DIFFERENCE_DEG = 0.7
-# Decrease of the log likelihood per second of flight, if a difference is e times larger
+# Decrease of the score per second of flight if a difference is e times larger
 SCORE_PER_S = 0.5
-# Minimum log likelihood ratio to the second best convention
+# Minimum score of the best convention above the second best, for an unambiguous result
 MIN_LOG_ODDS = 4.0
-# Maximum number of samples that are compared with the attitude
+# Maximum number of orientations that are compared with the reference
 MAX_SAMPLES = 600
-# Minimum number of samples in flight
+# Minimum number of orientations in flight for a check
 MIN_SAMPLES = 20
 
 
 class Candidate(NamedTuple):
-    """Assumed convention of an orientation, with its difference from the attitude."""
+    """Assumed convention of an orientation, with its difference from the reference attitude."""
 
     convention: OrientationConvention
     heading_difference_deg: float
@@ -60,30 +61,30 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames; ENU and NWU are equal, because they differ only in heading."""
+        """Order and frames of the quaternion, with NWU for ENU: both differ only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
     inertial: Inertial, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine order and frames of an orientation.
+    """Determine quaternion order and frames of a source's orientation, or None with few samples.
 
     Parameters
     ----------
     inertial : Inertial
     time_s : ndarray, shape (n,)
     quaternion : ndarray, shape (n, 4)
-        As sent; w, x, y, z by definition of the message.
+        Orientation as sent; the message defines the order w, x, y, z.
 
     Returns
     -------
     convention : OrientationConvention
         Without ``heading_error_deg``.
     time_s : ndarray, shape (m,)
-        Some of the times in flight.
+        At most MAX_SAMPLES of the times in flight.
     attitude : ndarray, shape (m, 4)
-        Orientation at these times, rotates FRD to NED.
+        Orientation at these times, converted to FRD to NED.
     """
     rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
     if len(rows) < MIN_SAMPLES:
@@ -123,7 +124,7 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 def _make_candidate(
     time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
-    """Convert an orientation by an assumed convention and compare it with the attitude."""
+    """Convert an orientation by an assumed convention, and compare it with the reference."""
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
     attitude = multiply(to_attitude(sent, convention), turn)

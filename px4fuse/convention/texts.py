@@ -1,11 +1,11 @@
-"""Faults of axes, unit and orientation in words, with the action."""
+"""Messages on wrong axes, unit and orientation of a position source, with the action."""
 
 from collections.abc import Sequence
 
 from px4fuse.convention.axes import UNITS
 from px4fuse.convention.model import Axes, Direction, Unit
 
-# Directions in such an order that the reversed order contains the opposite directions
+# Directions ordered so that the reversed tuple contains the opposite of each direction
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {
@@ -32,9 +32,9 @@ def axes_as_sent(axes: Axes, frame: str) -> Axes:
     Parameters
     ----------
     axes : tuple of str
-        Directions of the converted axes, which were taken for north, east, down.
+        True directions of the axes that the reader took for north, east, down.
     frame : {"NED", "ENU", "NWU"}
-        Frame from which they were converted.
+        Frame that the reader assumed for the file.
     """
     true_directions = dict(zip(DIRECTIONS, with_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
@@ -46,7 +46,7 @@ def format_axes(axes: Sequence[str], unit: str) -> str:
 
 
 def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) -> tuple[str, str]:
-    """Describe wrong axes and the action.
+    """Describe wrong axes of a position source or file, and the action.
 
     >>> describe_axes(("east", "north", "up"), "NED", is_mirrored=False, is_file=True)
     ('ENU read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
@@ -68,11 +68,11 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
     if is_file and name:
         return fault, f"Run again with --position-frame {name.lower()}."
     if is_file:
-        return fault, f"Write {ned}, and give --position-frame ned."
+        return fault, f"Write {ned} to the file, and run again with --position-frame ned."
     if name == "ENU":
         return fault, (
-            "MAVROS converts to NED: publish ENU and FLU on vision_pose/pose. Own sender or ROS 2: "
-            f"send {ned}."
+            "With MAVROS publish ENU and FLU on vision_pose/pose, which MAVROS converts to NED. "
+            f"Without MAVROS send {ned}."
         )
     return fault, f"Send {ned}."
 
@@ -80,7 +80,7 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
 def describe_unit(
     unit: Unit, positions: str, stated: str = "metres", *, is_file: bool
 ) -> tuple[str, str]:
-    """Describe a wrong unit and the action.
+    """Describe a wrong length unit of a position source or file, and the action.
 
     >>> describe_unit("cm", "positions", is_file=True)
     ('positions are in centimetres, not in metres', 'Run again with --position-unit cm.')
@@ -88,12 +88,13 @@ def describe_unit(
     fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
-    where = "in the file" if is_file else "before they are sent"
-    return fault, f"Multiply x, y and z by {UNITS[unit]:g} {where}."
+    return fault, (
+        f"Multiply x, y and z by {UNITS[unit]:g} {'in the file' if is_file else 'before sending'}."
+    )
 
 
 def describe_conversion(frames: str) -> str:
-    """Describe the conversion of an orientation to FRD and NED.
+    """Describe the conversion of a quaternion from other frames to FRD and NED.
 
     >>> describe_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'

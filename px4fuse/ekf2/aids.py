@@ -26,14 +26,15 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum |mean innovation| / RMS innovation of an aiding source that counts as biased
+# Minimum ratio of |mean innovation| to RMS innovation for the verdict that an aiding source is
+# biased
 MIN_BIAS_SHARE = 0.5
-# Minimum |mean innovation| / √S of an aiding source that counts as biased
+# Minimum |mean innovation| (√S) for the verdict that an aiding source is biased
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which the normalised innovations ν/√S are averaged, to detect a
 # change of their mean in flight
 WINDOW_S = 10.0
-# Minimum number of innovations for the mean of a window
+# Minimum number of innovations in a window
 MIN_WINDOW_SAMPLES = 5
 # Minimum number of windows before a change of the mean normalised innovation
 MIN_WINDOWS_BEFORE = 2
@@ -45,10 +46,11 @@ MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
 NOT_FUSED_LIMIT_S = 5.0
-# Maximum time without a fused sample in median intervals between logged samples, for topics that
-# are logged at a reduced rate
+# Maximum time without a fused sample of an enabled aiding source, as a multiple of the median
+# interval between logged samples: topics may be logged at a reduced rate
 NOT_FUSED_INTERVALS = 10.0
-# Maximum relative difference between √R and a noise parameter from which R is derived
+# Maximum relative difference between √R and a noise parameter, to conclude that R is from this
+# parameter
 NOISE_TOLERANCE = 0.02
 # Minimum height (m) above ground at which innovations are evaluated, or half of the maximum height
 # of a low flight: rotor downwash disturbs the barometer, and PX4's land detector may fail

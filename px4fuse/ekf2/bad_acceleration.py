@@ -52,14 +52,15 @@ class BadAcceleration:
         self.logged_since_s, self.logged_until_s = np.append(time_s, np.inf)[edges].reshape(-1, 2).T
         self.since_s = np.full(len(follows_log), time_s[0])
         self.until_s = np.full(len(follows_log), time_s[0] + duration_s * float(is_logged[0]))
-        # latest innovations of barometer and GNSS, and the largest of them
+        # latest innovations (√S) of barometer and GNSS, and the largest of these innovations
         self.ratios = np.full((2, len(follows_log)), np.nan)
         self.largest_ratio = 0.0
 
     def share(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set; None if it is not set.
 
-        Intervals are successive. The flag from the log is set to its value at the end.
+        Call this method for successive intervals: a flag that follows the log gets the logged value
+        at the end of the interval.
         """
         if len(self.logged_since_s):
             row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -86,7 +87,7 @@ class BadAcceleration:
         previous_largest, self.largest_ratio = self.largest_ratio, np.fmax.reduce(ratios, axis=None)
         if max(previous_largest, self.largest_ratio) <= MIN_LARGER_RATIO:
             return
-        # the latest innovations are valid until the next ones
+        # an innovation is valid until the next innovation of the same sensor
         gnss = previous_ratios[-1]
         pressure = np.full(len(gnss), np.nan)
         for ratio in previous_ratios[:-1]:

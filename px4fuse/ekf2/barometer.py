@@ -1,4 +1,4 @@
-"""Barometer samples that EKF2 fused, also those that the logger dropped.
+"""Barometer samples that EKF2 fused, including samples that the logger dropped.
 
 The default logging profile has 5 of 10 or 20 samples per second in ``vehicle_air_data``. Each row
 of ``estimator_aid_src_baro_hgt`` contains another sample (without EKF2's bias), and each row of
@@ -20,20 +20,22 @@ from px4fuse.ekf2.replay_segments import INNOVATION_FILTER_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 
-# Rate (Hz) at which EKF2 fuses the barometer, from PX4 v1.15 on, if the variance of the barometer
-# bias does not show the rate
+# Rate (Hz) at which EKF2 of PX4 v1.15 and later fuses the barometer, if the variance of the
+# barometer bias does not show the rate
 BAROMETER_HZ = 10.0
-# Rate (Hz) at which EKF2 fuses the barometer, before PX4 v1.15
+# Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 OLD_BAROMETER_HZ = 15.0
 # Maximum relative interquartile range of sample intervals that are computed from the bias variance
 MAX_INTERVAL_SCATTER = 0.1
-# Maximum time difference of two data of one sample, in sample intervals
+# Maximum difference of two times that belong to the same sample, in sample intervals
 MATCH_TOLERANCE = 0.3
-# Maximum number of samples between two rows for reconstructing them from the filtered innovation
+# Maximum number of samples between two rows of the log for reconstructing the samples from the
+# filtered innovation
 MAX_SAMPLES_PER_ROW = 30
-# Maximum number of samples that one sample replaces
+# Maximum number of missing samples for which one sample stands
 MAX_WEIGHT = 4.0
-MIN_WEIGHT = 1e-9  # minimum weight of missing samples, to avoid a division by zero
+# Minimum weight of missing samples, to avoid a division by zero
+MIN_WEIGHT = 1e-9
 
 
 def sample_interval_s(record: FusionRecord) -> float:
@@ -70,7 +72,7 @@ def fused_samples(ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]") 
     interval_s = sample_interval_s(record)
     samples = _known_and_simulated_samples(ekf2, record, logged, interval_s)
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
-    # a sample replaces half of the missing samples before and after it
+    # each sample stands for half of the missing samples before and half of those after it
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
     return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_WEIGHT)})
 
@@ -88,11 +90,11 @@ def _known_and_simulated_samples(
     no_bias = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
     no_bias |= {"innovation_m": np.nan, "variance_m2": 1.0}
     bias = record.height_bias.get(BAROMETER.name, pd.DataFrame(no_bias, index=row_s[:1]))
-    # EKF2 logs the bias after the update with a sample, but fuses the sample with the previous bias
+    # EKF2 logs the bias after the update, but fuses the sample with the bias before the update
     bias_s = np.column_stack([bias.index, bias.index + 0.5 * interval_s]).ravel()
     previous_m = bias["bias_m"] - (_bias_gain(bias) * bias["innovation_m"]).fillna(0.0)
     fused_bias_m = np.column_stack([previous_m, bias["bias_m"]]).ravel()
-    # in ground effect the logged innovation is reduced by the dead zone
+    # innovations in ground effect are not used: EKF2 reduces them by the dead zone
     calm = rows[~record.was_in_state(GROUND_EFFECT, row_s)]
     still_m = calm["observation_down"] - calm["innovation_down"]
     still_m -= np.interp(calm.index, velocity_s, moved_m)
@@ -101,11 +103,11 @@ def _known_and_simulated_samples(
         return np.asarray(np.interp(time_s, bias_s, fused_bias_m))
 
     def prediction_m(time_s: Array) -> Array:
-        """Return EKF2's prediction of the logged height, with the motion between rows."""
+        """Return EKF2's prediction of the logged height, including motion between logged rows."""
         state_m = np.interp(time_s, calm.index, still_m) + np.interp(time_s, velocity_s, moved_m)
         return np.asarray(state_m - bias_m(time_s))
 
-    # one row per row of the log, one column per sample since the previous row
+    # arrays have one row per row of the log, and one column per sample since the previous row
     span_s = np.diff(row_s)
     count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = np.abs(span_s - count * interval_s) < MATCH_TOLERANCE * interval_s
@@ -113,7 +115,7 @@ def _known_and_simulated_samples(
     sample_s = span_s / count
     column = np.arange(count[is_regular].max(initial=1))
     innovation_m = np.full((len(count), len(column)), np.nan)
-    # samples of several topics; the last one is preferred if they are the same sample
+    # the same sample may be in several topics; the last topic is then preferred
     time_s = np.concatenate([bias.index, logged.index, row_s])
     down_m = np.concatenate(
         [
@@ -131,7 +133,7 @@ def _known_and_simulated_samples(
         down_m - prediction_m(time_s)
     )[is_matched]
     if "filtered_down" in rows:
-        # PX4 logs state minus measurement
+        # the sign is reversed, because PX4 logs state minus measurement
         filtered_m = -rows["filtered_down"].to_numpy()
         age = count[:, None] - 1.0 - column
         is_missing = np.isnan(innovation_m) & (age >= 0.0) & is_regular[:, None]

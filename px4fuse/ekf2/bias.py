@@ -12,11 +12,11 @@ from px4fuse.core.arrays import Array, BoolArray
 
 # Noise density (m/s/√Hz) of the random walk of the bias (bias_nsd, common.h)
 BIAS_DENSITY = 0.13
-# Minimum variance (m²) of the bias
+# Minimum variance (m²) of the sensor bias
 MIN_VARIANCE_M2 = 1e-8
-# Minimum measurement variance (m²) in updates of the bias
+# Minimum measurement variance R (m²) in updates of the sensor bias
 MIN_NOISE_M2 = 1e-4
-# Innovation gate (√S) in updates of the bias
+# Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
 # Maximum |mean| of test ratio times sign of the innovation: if it is larger, EKF2 multiplies the
 # variance of the random walk by RANDOM_WALK_FACTOR (isOffsetDetected)

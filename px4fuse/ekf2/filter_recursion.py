@@ -41,7 +41,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0
-MIN_STATE_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
+# Minimum state variance, to avoid a division by zero
+MIN_STATE_VARIANCE = 1e-30
 # Maximum |ln(NIS / gate²)| of a position sample near the gate limit. If EKF2's rejection of this
 # sample is not logged, the rejection is inferred from the published position
 MAX_LOG_RATIO = 1.0
@@ -72,7 +73,8 @@ INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
 VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
-HEIGHT_NOISE_FACTOR = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
+# Factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
+HEIGHT_NOISE_FACTOR = 1.5
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
 # Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
@@ -351,13 +353,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         :, :, None, None
     ]
     if (share := segment.clipped_share) is not None:
-        # fraction of accelerometer axes with BAD_ACCELERATION_NOISE, averaged over each interval
+        # mean fraction of accelerometer axes in each interval that have BAD_ACCELERATION_NOISE
         share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
         mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
         acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
     x, P = _start_state(segment, biases, attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # EKF2 has not estimated the accelerometer bias, but would have with other parameters
+        # while EKF2 declared its acceleration bad, the log contains no bias estimate:
+        # configurations that do not follow the log start with a bias from the published velocity
         has_bias = ~bad_acceleration.follows_log & biases
         P[has_bias, BIAS_DOWN, :] = 0.0
         P[has_bias, :, BIAS_DOWN] = 0.0
@@ -464,8 +467,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             if is_sequential:
                 if field_samples is None:
-                    # reduce the tilt variance to its logged value; without logged magnetometer
-                    # samples, the correction of the tilt is unknown
+                    # without logged magnetometer samples the correction of the tilt is unknown, so
+                    # only the tilt variance is set to the logged value
                     for row in range(HEADING):
                         _, P = _reduce_variance_to(P, row, attitude_variance[e, :, row])
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]

@@ -16,15 +16,29 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.flight.ekf2_parameters import AID_MASK, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, step_values_at
 
-EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
-EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
-STOP_S = 7.0  # s without GNSS, or without vision up to v1.13; reset_timeout_max
-MAX_HORIZON_S = 1.0  # s; maximum of the delay parameters of EKF2
-BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwrite the sample
-TIME_STEP_S = 5e-7  # s; half of the resolution of timestamps
-GATE_TIME_S = 1.0  # s; EKF2 stops fusion after rejections for this time (no_aid_timeout_max)
-MAX_CONSTANT_M = 1e-3  # range of positions that contain no measurement
-MIN_FAILED_FRACTION = 0.1  # of the time; EKF2 waits 10 s after each failure of a check
+# Maximum interval (s) between two vision samples for EKF2 to start fusion: EV_MAX_INTERVAL of PX4
+# v1.14 and later (ev_control.cpp)
+EV_START_INTERVAL_S = 0.2
+# Maximum time (s) without a vision sample before EKF2 stops fusion: 2 EV_MAX_INTERVAL
+# (ev_pos_control.cpp)
+EV_STOP_INTERVAL_S = 0.4
+# Maximum time (s) without a GNSS sample, or up to v1.13 without a vision sample, before EKF2 stops
+# fusion: reset_timeout_max
+STOP_S = 7.0
+# Maximum value (s) of EKF2's delay parameters
+MAX_HORIZON_S = 1.0
+# Number of position samples that EKF2 buffers: a sample with a timestamp in the future is
+# overwritten after this number of new samples
+BUFFER_COUNT = 20
+# Tolerance (s) in comparisons of intervals: half of the resolution of timestamps
+TIME_STEP_S = 5e-7
+# Time (s) of rejections after which EKF2 stops fusion: no_aid_timeout_max
+GATE_TIME_S = 1.0
+# Maximum range (m) of positions that are constant, because the source does not measure them
+MAX_CONSTANT_M = 1e-3
+# Minimum fraction of the time with a failed GNSS check for naming the check as the reason: after
+# each failure EKF2 waits 10 s
+MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
 )
@@ -32,7 +46,8 @@ SYNCHRONISE = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Clocks of timestamp_sample that EKF2 cannot use, and the effect on EKF2
+# Clocks of timestamp_sample that EKF2 cannot use, and the apparent age of positions with these
+# timestamps in EKF2
 STAMP_FAULTS = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
     **dict.fromkeys(
@@ -41,8 +56,8 @@ STAMP_FAULTS = {
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
     "nanoseconds": "in the future",
 }
-# Checks of GNSS by bit of gps_check_fail_flags, with parameter and unit of the limit. The bit of
-# EKF2_GPS_CHECK is lower by one; the fix is always checked
+# GNSS checks by bit of gps_check_fail_flags, each with the parameter and the unit of the limit. In
+# EKF2_GPS_CHECK, the bit of a check is lower by one; EKF2 always checks the fix
 GNSS_CHECKS = (
     ("3D fix", "", ""),
     ("number of satellites", "EKF2_REQ_NSATS", ""),
@@ -103,12 +118,12 @@ class Attempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later."""
+        """True if EKF2 has a parameter to enable this source alone: PX4 v1.14 and later."""
         return self.aid.switch in self.parameters
 
     @property
     def horizon_s(self) -> float:
-        """Age that EKF2 buffers; if it is not logged, EKF2_DELAY_MAX or else an upper limit."""
+        """Maximum age (s) that EKF2 buffers; if not logged, EKF2_DELAY_MAX or MAX_HORIZON_S."""
         horizon_s = self.ekf2.horizon_s
         limit_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
         return horizon_s if isinstance(horizon_s, float) else limit_s
@@ -118,11 +133,11 @@ class Attempt:
         return 1.0 / self.source.rate_hz
 
     def within(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples in the span, and those up to ``before_s`` before it."""
+        """Return the samples in ``span_s``, and up to ``before_s`` (s) before its start."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
     def fraction(self, state: str, bit: int = 0) -> float:
-        """Return the fraction of the span in which a bit of a state is set; NaN if not logged."""
+        """Return the fraction of ``span_s`` in which a bit of a state is set; NaN if not logged."""
         steps = self.ekf2.states.get(state)
         if steps is None:
             return float("nan")
@@ -144,9 +159,12 @@ def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
     if value >> bit & 1:
         return
     quantity = "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
-    reason, action = f"Bit {bit} ({quantity}) is not set.", f"Set {name} to {value | 1 << bit}."
+    reason, action = (
+        f"Bit {bit} ({quantity}) of {name} is not set.",
+        f"Set {name} to {value | 1 << bit}.",
+    )
     if is_height_only(attempt.source):
-        reason = f"x and y are constant: the source contains no horizontal position. {reason}"
+        reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {name} unset."
     yield Unmet("switch", f"{name} is {value}", reason, action)
 
@@ -173,13 +191,13 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
     limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
-    # EKF2 stops fusion when the gap has lasted for limit_s
+    # EKF2 stops fusion when no position has arrived for limit_s
     last_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_s
     if duration_s > limit_s + attempt.interval_s:
         yield Unmet(
             "gap",
-            f"no position for {duration_s:.1f} s from {last_s:.1f} s",
+            f"no position for {duration_s:.1f} s from {last_s:.1f} s on",
             f"EKF2 stops fusion {limit_s:g} s after the last position.",
             "Restore the line of sight and the link of the position source.",
         )
@@ -191,7 +209,7 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "clock",
             f"the timestamps are {clock if clock == '0' else f'in {clock}'}",
-            "EKF2 reads timestamp_sample in microseconds since the autopilot's boot: for it the "
+            "EKF2 reads timestamp_sample in microseconds since the autopilot's boot. For EKF2 the "
             f"positions are {STAMP_FAULTS[clock]}.",
             SYNCHRONISE if "UNIX" in clock or "clock" in clock else SET_TIMESTAMP,
         )
@@ -203,14 +221,14 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "age",
             f"the timestamps are {-age_s:.2f} s in the future",
-            f"EKF2 waits for this time, but buffers only {BUFFER_COUNT} positions.",
+            f"EKF2 waits until this time, but buffers only {BUFFER_COUNT} positions.",
             SYNCHRONISE,
         )
     if age_s > attempt.horizon_s + MAX_LATENESS_S:
         action = SYNCHRONISE
         if age_s < MAX_HORIZON_S:
             action = (
-                "Check the clock of the sender. Then set EKF2_DELAY_MAX to "
+                "Check the clock of the positioning system. Then set EKF2_DELAY_MAX to "
                 f"{50.0 * np.ceil(20.0 * age_s):.0f} ms (v1.15 and later)."
             )
         yield Unmet(
@@ -227,29 +245,31 @@ def _check_quality(attempt: Attempt) -> Iterator[Unmet]:
     if minimum <= 0.0 or "quality" not in status:
         return
     quality = attempt.within(status)["quality"]
-    # the sample, the one before it, and the newest in the buffer must be good
+    # EKF2 needs a good quality of the sample, of the sample before, and of the newest sample in the
+    # buffer
     count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
     is_good = (quality >= minimum).astype(float)
     if is_good.rolling(min(count, max(len(quality), 1))).min().max() == 1.0:
         return
     median = float(quality.median())
     reason = (
-        f"{100.0 * (1.0 - is_good.mean()):.0f} % of {len(quality)} positions are below this limit."
+        f"{100.0 * (1.0 - is_good.mean()):.0f} % of {len(quality)} positions are below the limit."
     )
     action = (
-        "Improve light and texture in view, or fly slower. Set EKF2_EV_QMIN to "
+        "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
         f"{max(median, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
-        reason += " VISION_POSITION_ESTIMATE has no quality, which EKF2 reads as 0."
-        action = "Send the quality (MAVLink ODOMETRY), or set EKF2_EV_QMIN to 0."
+        reason += " The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
+        action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median:.0f}, below EKF2_EV_QMIN {minimum:.0f}"
     yield Unmet("quality", fault, reason, action)
 
 
 def _check_interval(attempt: Attempt) -> Iterator[Unmet]:
     intervals_s = np.diff(attempt.within(attempt.source.samples).index)
-    # the rate of a reconstructed source is that of the logger
+    # a source that is reconstructed from EKF2 topics has the rate of the logger, not of the
+    # positioning system
     is_known = attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
     if is_known and intervals_s.min() >= EV_START_INTERVAL_S - TIME_STEP_S:
         yield Unmet(
@@ -267,7 +287,7 @@ def _check_alignment(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "alignment",
             "EKF2 has not aligned its tilt",
-            "cs_tilt_align is 0. EKF2 fuses no position before.",
+            "The flag cs_tilt_align is 0. EKF2 fuses no position before the tilt is aligned.",
             "Keep the vehicle at rest after boot until EKF2 is ready.",
         )
     is_free = attempt.is_vision and attempt.has_switch and attempt.source.frame == "FRD"
@@ -278,7 +298,7 @@ def _check_alignment(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "alignment",
             "EKF2 has not aligned its heading",
-            "cs_yaw_align is 0. EKF2 needs a heading before it fuses positions relative to north.",
+            "The flag cs_yaw_align is 0. EKF2 needs a heading to fuse positions relative to north.",
             f"{action}.",
         )
 
@@ -288,8 +308,8 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "fault",
             "EKF2 declared GNSS faulty",
-            "cs_gnss_fault is set: GNSS and another position source contradicted each other for "
-            "7 s.",
+            "The flag cs_gnss_fault is set: GNSS and another position source contradicted each "
+            "other for 7 s.",
             "Compare both sources. EKF2_GPS_MODE 1 permits a reset to GNSS.",
         )
     parameters, source = attempt.parameters, attempt.source
@@ -309,7 +329,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
         text = f"{name} ({100.0 * fractions[bit]:.0f} % of the time"
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
             value = float(np.sqrt(squares[bit].median())) if bit in squares else np.nan
-            # positions without a fix are not in the samples
+            # the samples contain only positions with a fix, so their median may be below the limit
             text += f", median {value:.2f}{unit}" if value > limit else ""
             text += f", limit {parameter} {limit:g}{unit}"
         texts.append(f"{text})")
@@ -332,14 +352,15 @@ def _check_gate(attempt: Attempt) -> Iterator[Unmet]:
         yield Unmet(
             "gate",
             f"EKF2 rejects {100.0 * fraction:.0f} % of the positions",
-            "The innovations are beyond its gate of "
+            "The innovations are beyond EKF2's gate of "
             f"{attempt.parameters.get(aid.gate, aid.default_gate):g} √S.",
             f"Check the frame of the positions, {aid.delay} and {aid.noise}. Increase {aid.gate} "
-            "last.",
+            "only if all three are correct.",
         )
 
 
-# In EKF2's order; the switch first, because it is the intention of the user
+# Vision checks in the order of EKF2, after the switch: the user may have disabled fusion
+# intentionally
 VISION_CONDITIONS = (
     _check_switch,
     _check_frame,
@@ -350,6 +371,6 @@ VISION_CONDITIONS = (
     _check_alignment,
     _check_gate,
 )
-# Checks before the gap: without a fix, the reader omits all samples, and the log contains the flags
-# of the last checks
+# GNSS checks in order; the receiver checks precede the gap, because without a fix the log contains
+# no position samples, but the flags of the last checks
 GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)

@@ -30,19 +30,22 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
-VELOCITY_DOWN, DOWN = 5, 8  # indices in the state
+# Indices of vertical velocity and height in the state
+VELOCITY_DOWN, DOWN = 5, 8
 SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHT_AIDS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
-DEFAULT_DEAD_ZONE_M = 4.0  # default of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
-HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # by value of EKF2_HGT_REF
+# Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
+DEFAULT_DEAD_ZONE_M = 4.0
+# PX4's name of the height reference, by value of EKF2_HGT_REF
+HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}
 # Maximum time (s) from the start of the replay to the first logged height bias: the bias is logged
 # at 2 Hz
 MAX_BIAS_LOG_DELAY_S = 1.0
 # Minimum rate (Hz) of the logged barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
-# Minimum innovation gate (√S) in EKF2
+# Minimum innovation gate (√S) that EKF2 uses
 MIN_GATE = 1.0
-# Minimum measurement noise (σ) in EKF2, of positions (m) and of velocities (m/s)
+# Minimum measurement noise (σ) that EKF2 uses, for positions (m) and velocities (m/s)
 MIN_SIGMA = 0.01
 
 
@@ -64,7 +67,8 @@ def add_heights(
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
     reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
-    if len(fused_aids) == 1:  # a single sensor is the reference
+    # a single height sensor is the reference
+    if len(fused_aids) == 1:
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
@@ -99,7 +103,7 @@ def add_heights(
         samples_inside = barometer_samples_inside(segment, *columns)
         rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
-            return f"the barometer is logged at {rate_hz:.1f} Hz"
+            return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
         state = segment.state.copy()
         state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
         heights = HeightSamples(tuple(fused_aids), reference, bias, *samples_inside)

@@ -63,11 +63,13 @@ VISION_COPY_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
-ROTATE_VISION_BIT = 64  # bit in EKF2_AID_MASK, up to PX4 v1.13
+# Bit of EKF2_AID_MASK that rotates vision positions, up to PX4 v1.13
+ROTATE_VISION_BIT = 64
 # Maximum time difference (s) between a logged innovation and the measurement time of its sample:
 # estimator_aid_src topics contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
-GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before PX4 v1.14 GNSS velocity is always fused
+# Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
+GNSS_VELOCITY_BIT = 4
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
@@ -76,9 +78,9 @@ MAX_RESET_PUBLICATION_S = 0.2
 MAX_IMU_INTERVAL_S = 0.012
 # Maximum fraction of IMU samples that EKF2 received but the log does not contain, outside gaps
 MAX_LOST_SHARE = 0.1
-# First release in which estimator_states has the time of the fusion horizon
+# First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Maximum number of position resets in a row, for releases without a limit
+# Number that stands for "no limit" of position resets in a row, for releases without a limit
 UNLIMITED_RESETS = 1_000_000
 # Maximum interval (s) between height and heading measurements in a gap of the position source
 MAX_INTERVAL_S = 0.25
@@ -248,7 +250,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     horizon_s = ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
-    if MODEL_NOTE in flight.log.notes:  # the simulated earth is a sphere without rotation
+    # the simulated earth is a sphere without rotation
+    if MODEL_NOTE in flight.log.notes:
         record = replace(record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
@@ -257,8 +260,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
         return Unavailable(
             ANALYSIS_NAME,
-            f"EKF2 fused horizontal aids besides {'GNSS' if is_gnss else 'vision position'} that "
-            f"the model does not contain ({', '.join(unmodelled_aids)})",
+            f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
             f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
     if missing_imu := _missing_imu(imu.index.to_numpy()):
@@ -379,7 +381,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
         # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
         # gps_control.cpp)
         reset_variance_factor = 2.0 if record.stores_latitude else 1.0
-        # in PX4 main since 2026, position and velocity have separate timeouts and resets
+        # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
         resets_together = GNSS_MODE not in record.parameters
         return FusionRules(
             np.inf,
@@ -392,7 +394,8 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             resets_together,
             bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
-    # times: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
+    # sources of the times: EV_MAX_INTERVAL (ev_control.cpp); no_aid_timeout_max and
+    # reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     if not fuses_by_mask(record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
@@ -433,7 +436,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         return Unavailable(
             ANALYSIS_NAME,
             f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
-            "Set bit 1 of SDLOG_PROFILE to log all fixes.",
+            "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
@@ -444,11 +447,12 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         is_enabled = step_values_at(enabled_log, samples.index) > 0.0
         samples = samples[is_enabled]
         velocities = velocities[is_enabled]
-    # the track has measurement times: add the delay, because the replay subtracts the delay again
+    # the times of the track are measurement times: the delay is added, because the replay subtracts
+    # the delay again
     flown_settings = effective_settings(parameters, GNSS_POS)
     flown_s = flown_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
-    # EKF2's upper limit of the reported position noise (m; gps_control.cpp)
+    # upper limit (m) of the reported position noise in EKF2 (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()

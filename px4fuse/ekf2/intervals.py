@@ -39,9 +39,9 @@ from px4fuse.trajectory.rotation import rotate, skew
 # Maximum time (s) from the passage of the fusion horizon to the arrival of a sample that EKF2 still
 # fuses (RingBuffer.h, pop_first_older_than)
 MAX_LATENESS_S = 0.1
-# Minimum delay (s) of the fusion of a sample that counts as late (3 cm at 1 m/s)
+# Minimum lateness (s) of a sample for reporting it as fused late: 3 cm at 1 m/s
 MIN_LATENESS_S = 0.03
-# Action on a position sample: none, update of the state, or start of fusion with a reset
+# Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
 # Number of columns of the sensitivities of the state at the end of an interval: to initial attitude
 # error, gyro bias and accelerometer bias (3 columns each), to the correction of the nominal
@@ -49,7 +49,7 @@ IDLE, FUSE, START = 0, 1, 2
 EFFECT_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
-# Array with one row per event (end of an interval), in time order
+# One row per event (end of an interval), in time order
 Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
@@ -93,7 +93,7 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """Age of a position at its timestamp (s), and delay of EKF2's fusion horizon (s)."""
+    """Age (s) of a position at its timestamp, and delay (s) of EKF2's fusion horizon."""
 
     delay_s: float
     horizon_s: float
@@ -136,9 +136,11 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     end = np.maximum.accumulate(np.minimum(end, last_step))
     is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
-    is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses only the newer of two samples in one step
+    # EKF2 fuses only the newer of two samples in one prediction step
+    is_usable[:-1] &= end[1:] > end[:-1]
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
-    # additional events in gaps of the position source; their number does not depend on the delay
+    # in gaps of the position source there are additional events; their number does not depend on
+    # the delay
     gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_places = np.cumsum(extra_events[:-1] + 1) - 1
@@ -232,7 +234,8 @@ def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    m = tilt / n  # mean sensitivity of velocity to the attitude error in one step
+    # mean sensitivity of velocity to the attitude error in one prediction step
+    m = tilt / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
     gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))

@@ -16,9 +16,11 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
-MIN_SIGMA_GAUSS = 0.01  # minimum noise (gauss) of the magnetometer in EKF2
+# Minimum magnetometer noise (gauss) that EKF2 uses
+MIN_SIGMA_GAUSS = 0.01
 EYE = np.eye(3)
-CROSS = skew(EYE).reshape(3, 9)  # for a vector v, v @ CROSS is the cross product matrix [v]×
+# Matrix with which v @ CROSS is the cross product matrix [v]× of a vector v
+CROSS = skew(EYE).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -114,7 +116,8 @@ def fuse_mean(
     nu = sample_mean.value - predicted
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # view, to add R to S in place
+    # diagonal is a view of S: adding R changes S in place
+    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
     innovation_record = np.empty((3, *nu.shape))
     innovation_record[0] = nu
     innovation_record[1] = diagonal + R[:, None]

@@ -73,7 +73,7 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
-# Fields of Agreement that do not have the name of the aiding source, by PX4's name of the source
+# Fields of Agreement with another name than the aiding source, by PX4's name of the source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
@@ -256,8 +256,8 @@ def replay_settings(
     if unknown_aids := without.keys() - set(fused_aids):
         height_note = f"; {height_text}" if inputs.logged_height_reason else ""
         raise SettingsError(
-            f"{min(unknown_aids)}: in this log the replay fuses only {', '.join(fused_aids)}"
-            f"{height_note}."
+            f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
+            f"{', '.join(fused_aids)}{height_note}."
         )
     if not changes:
         return ()
@@ -439,7 +439,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
 def _other_aid_updates(
     runs: Sequence[SegmentRun], configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with height and vision in addition to the position source.
+    """Return the updates with height sensors and with vision that is fused in addition to GNSS.
 
     Keys are PX4's names of the aiding sources.
     """

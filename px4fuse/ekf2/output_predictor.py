@@ -87,7 +87,8 @@ def publish(
     velocity = dead_reckoned + velocity_correction
     # the IMU changes the velocity within a step; corrections apply at the end of the step
     position_increments = (velocity[:-1] + 0.5 * velocity_increments) * step_s
-    position_without_resets = state[:, POSITION] - reset_m  # EKF2 shifts the buffer with a reset
+    # a reset is removed, because EKF2 shifts the whole buffer with a reset
+    position_without_resets = state[:, POSITION] - reset_m
     dead_reckoned = np.cumsum(
         np.concatenate([position_without_resets[:1], position_increments]), axis=0
     )

@@ -52,12 +52,13 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
     "velocity_rejected",
 ]
-MIN_SAMPLES = 20  # minimum number of logged innovations for a comparison with the replay
+# Minimum number of logged innovations for a comparison with the replay
+MIN_SAMPLES = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation: estimator_innovations repeats a sample
 # with later timestamps until the next fusion
 MAX_INNOVATION_AGE_S = 0.5
-# Maximum time (s) between fusion and publication in the same prediction step
+# Maximum time (s) between fusion and publication for treating both as the same prediction step
 SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 in simulated flights with
 # complete logs, below 0.9 with a downsampled source or IMU dropouts (see
@@ -72,15 +73,15 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum difference (m) of the published position while optical flow is the only horizontal aiding
 # source: larger, because optical flow is logged at a reduced rate
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Maximum rejected fraction for a comparison of single innovations. With more rejections one sample
-# near the gate limit changes many later samples. Then only rejected fraction and mean NIS are
-# compared, and single innovations in another replay with logged rejections
+# Maximum rejected fraction for comparing single innovations. With more rejections, one sample near
+# the gate limit changes many later samples: then only rejected fraction and mean NIS are compared,
+# and single innovations in a second replay with the logged rejections
 MANY_REJECTIONS_SHARE = 0.05
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
 MAX_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M for the replay with logged rejections
+# Factor on MAX_PUBLISHED_DIFFERENCE_M for a replay with logged rejections
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
@@ -244,7 +245,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Evaluated times: the segments without their first seconds and without flow-only times."""
+        """Spans (s) of the replay without the first seconds and without times of flow only."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -302,9 +303,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         doubtful_aids[FLOW.name] = (
-            f"while {FLOW.label} was the only horizontal aid, replayed and logged positions differ "
-            f"by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m (limit "
-            f"{MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
+            f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
+            f"positions differ by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     return Agreement(
         north=north,
@@ -408,7 +409,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         log = ekf2.aids[name]
         is_own_topic = aid_source(AIDS[name]) in log.topics
         rows = logged_aid_innovations(name, log)
-        # EKF2 fuses a barometer sample at once, the replay at the next event
+        # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
@@ -498,7 +499,8 @@ def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) ->
     row = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
     age = times - fused_at[np.maximum(row, 0)]
     is_match = (row >= 0) & (age <= MAX_INNOVATION_AGE_S)
-    # a row from the prediction step of a fusion may still contain the previous innovation
+    # a row that is logged in the prediction step of a fusion may still contain the previous
+    # innovation
     is_clear = is_match & (age >= SAME_STEP_S)
     return np.where(is_clear if is_clear.sum() > 0.5 * is_match.sum() else is_match, row, -1)
 
@@ -570,8 +572,8 @@ def _agreement_verdict(
     ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(ratio - 1.0) > MAX_S_DIFFERENCE:
         return False, (
-            f"S ratio replay / log is {ratio:.2f} (tolerance {MAX_S_DIFFERENCE:.0%}): EKF2 fused "
-            "samples that are not in the log"
+            f"the innovation variance of the replay is {ratio:.2f} times the logged one (tolerance "
+            f"{MAX_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = f"the correlation {min_correlation:.4f} of replayed and logged innovations"
@@ -601,7 +603,7 @@ def _agreement_verdict(
 
 
 def _format_beyond(value: float, limit: float) -> str:
-    """Format a value with at least two decimals, and so many that it is above ``limit``."""
+    """Format a value with two decimals, or with more if it would not be above ``limit``."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 

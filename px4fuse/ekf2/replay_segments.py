@@ -1,4 +1,4 @@
-"""Parts of a flight without gaps for the EKF2 replay: prediction steps and initial state.
+"""Segments of a flight for the EKF2 replay, without gaps: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -43,7 +43,8 @@ MIN_FUSION_S = 1.0
 # Minimum time (s) from take-off to the start of the replay: on the ground EKF2 fuses zero velocity
 # and gravity, and only motion in the air distinguishes tilt from accelerometer bias
 MIN_AIRBORNE_S = 4.0
-SETTLING_S = 5.0  # time (s) from the start of a replay to the start of its evaluation
+# Time (s) from the start of a replay to the start of the evaluation
+SETTLING_S = 5.0
 # Time (s) from the first logged fusion of all magnetometer axes until the log contains the magnetic
 # field states that EKF2 resets after take-off
 FIELD_RESET_S = 1.0
@@ -55,23 +56,29 @@ MAG_FUSION_HZ = 14.0
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 INNOVATION_FILTER_S = 0.5
-MIN_SEGMENT_S = 10.0  # minimum length of a replayed segment
+# Minimum length (s) of a replayed segment
+MIN_SEGMENT_S = 10.0
 # Maximum delay (s) from a reset to its publication: largest delay of the fusion horizon plus one
 # logging interval
 MAX_RESET_DELAY_S = 0.5
-# Maximum fraction of clipped IMU samples within 1 s; above, the replay is interrupted
+# Maximum fraction of clipped IMU samples within 1 s: with more, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
-# Maximum fraction of IMU samples outside gaps that the log lacks, to count only logged samples
+# Maximum fraction of IMU samples that the log lacks outside gaps, for ignoring the missing samples
+# in prediction steps
 MAX_LOST_IMU_SHARE = 0.02
 
-GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # NED; CONSTANTS_ONE_G in PX4
+# Gravity in NED (CONSTANTS_ONE_G in PX4)
+GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])
 
-STATE_COUNT = 15  # number of states without magnetic fields
-IMU_STATE_COUNT = 9  # number of states that the IMU propagates: all except the biases
-# Indices in the state
+# Number of states without magnetic fields
+STATE_COUNT = 15
+# Number of states that the IMU propagates: all except the biases
+IMU_STATE_COUNT = 9
+# State indices of attitude error, velocity, position and biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, with 21 states
+# State indices of the earth field (NED) and the body field (FRD), if there are 21 states
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 
 @dataclass(frozen=True)
@@ -434,7 +441,8 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 def _clipped_share(imu: pd.DataFrame, time_s: Array) -> Array:
     """Return the fraction of clipped accelerometer axes in the step until each time."""
     share_by_step = np.zeros(len(time_s))
-    if "clipped" in imu:  # one bit per axis
+    # "clipped" has one bit per axis
+    if "clipped" in imu:
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
         np.maximum.at(share_by_step, np.searchsorted(time_s, clipped.index), clipped_share)
@@ -597,7 +605,8 @@ def low_pass_weights(
     step, weight : ndarray, shape (m, k)
         Newest sample first; k is the largest number of samples in a mean.
     """
-    age = np.arange(int(count.max(initial=1.0)))  # in sample intervals
+    # age of a sample, in sample intervals
+    age = np.arange(int(count.max(initial=1.0)))
     weight = np.where(age < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** age, 0.0)
     weight /= weight.sum(axis=1, keepdims=True)
     measured_at_s = newest_s[:, None] - age * interval_s[:, None]

@@ -37,7 +37,7 @@ ANALYSIS_NAME = "difference KF - EKF2"
 OTHER_TIME = Unavailable(
     "RMSE against ground truth",
     "ground truth and replay do not overlap in time",
-    "Record both at the same time.",
+    "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2. "process noise" is the increase of the
 # velocity variance per second: SIGMA_A² · DT in KF, and EKF2_ACC_NOISE² · Δt in EKF2 with the
@@ -54,8 +54,8 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# Order in which EKF2 properties replace KF properties. A flight in which EKF2 fuses further aiding
-# sources has one more step for each of them, before GATE
+# Order in which EKF2 properties replace KF properties. If EKF2 fuses more aiding sources in a
+# flight, each of them is an additional property, before GATE
 STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
@@ -229,7 +229,7 @@ def explain_by_steps(
     if not len(times):
         return Unavailable(
             ANALYSIS_NAME,
-            "KF and the EKF2 replay have no time in common",
+            "the times of KF and of the EKF2 replay do not overlap",
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
     span = float(times[0]), float(times[-1])
@@ -237,7 +237,7 @@ def explain_by_steps(
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
     without_gate = flown_replay.delayed
     stages = []
-    # one track at a time, to limit memory
+    # tracks are computed one at a time, to limit memory
     tracks = chain(delayed, (flown_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(

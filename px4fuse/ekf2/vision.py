@@ -28,8 +28,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # Maximum time (s) without a vision sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
-# Maximum time (s) of vision samples outside the gate before EKF2 resets the vision bias or the
-# position (no_aid_timeout_max, common.h)
+# Maximum time (s) with all vision samples outside the gate, before EKF2 resets the vision bias or
+# the position (no_aid_timeout_max, common.h)
 MAX_REJECTED_S = 1.0
 
 
@@ -54,7 +54,8 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses only the newer of two samples in one step
+    # EKF2 fuses only the newer of two samples in one prediction step
+    is_usable[:-1] &= step[1:] > step[:-1]
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - segment.body_to_ned[step] @ lever_arm_m)[:, :2]
@@ -162,7 +163,8 @@ class VisionFilter:
         noise_m2 = self.noise_m2[slot, e]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        diagonal = S.reshape(len(S), -1)[:, ::3]  # view of S: `diagonal += R` changes S
+        # diagonal is a view of S: `diagonal += R` changes S
+        diagonal = S.reshape(len(S), -1)[:, ::3]
         distance_m = (
             self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
         )

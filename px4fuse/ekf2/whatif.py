@@ -49,21 +49,21 @@ HEADING_LOGGED_NOTE = (
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
 HEIGHT_START_NOTE = (
-    ". It starts with the height that EKF2 estimated with the logged parameters while it declared "
-    "its acceleration bad, so the height may be wrong at first"
+    ". The replay starts with a height that EKF2 estimated while it declared the acceleration bad, "
+    "so the replayed height may be wrong at first"
 )
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
     "with external vision the replay uses the logged EKF2 heading",
-    "Read the heading in the log.",
+    "Use the logged heading of EKF2.",
 )
 HEIGHT_NOT_REPLAYED = Unavailable(
-    "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
+    "height error", "the replay uses the logged EKF2 height", "Use the logged height of EKF2."
 )
 # Minimum evaluated time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
-# Number of parameter values of a sweep, by default and at most
+# Default number and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
 # Position noise (m) that is added in repeated replays: the result of a replay is predictable if
@@ -73,7 +73,7 @@ ADDED_NOISE_M = 0.002
 ADDED_NOISE_RUNS = 4
 # Minimum rejected fraction for which replays are repeated to test if the result is predictable
 MIN_REJECTED_SHARE = 0.02
-# Maximum rejected fraction of a predictable result
+# Maximum rejected fraction for a predictable result of a replay
 MAX_REJECTED_SHARE = 0.35
 # Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
@@ -257,7 +257,8 @@ def what_if(
     evaluated_s = model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
-        # later segments are not used: the disabled source affected the logged states at their start
+        # later segments are not used, because the disabled source affected the logged states from
+        # which they start
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -299,8 +300,8 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     heading = HEADING_LOGGED_NOTE
     if difference_deg is not None:
         heading = (
-            "Heading is replayed with the magnetometer (as flown it differs from the log by "
-            f"{difference_deg:.1f}° RMS)"
+            "Heading is replayed with the magnetometer (with the logged parameters it differs from "
+            f"the log by {difference_deg:.1f}° RMS)"
         )
     height = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
     is_bad = model.inputs.segments[0].is_acceleration_bad
@@ -371,7 +372,7 @@ def _mark_unpredictable(
 
 
 def _results_agree(runs: Sequence[Summary]) -> bool:
-    """Return True if NIS, rejected fraction and RMSE of all runs agree within the limits."""
+    """Return True if NIS, rejected fraction and RMSE of all replays agree: predictable result."""
     rmse = [
         error for summary in runs if isinstance(error := summary.position_rmse_to_truth_m, float)
     ]
@@ -446,7 +447,8 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
         longest_gap_s = _longest_between_fusions(np.concatenate([fused_s, resets]), evaluated_s)
-    assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
+    # a flight with a replay has an attitude
+    assert isinstance(flight.attitude, pd.DataFrame)
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
         name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates
@@ -591,15 +593,20 @@ def _deviation_note(
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
-    height = f"; the height by at most {down.max():.3g} m" if heights & {*replays_without} else ""
+    height = (
+        f"; the published height differs by at most {down.max():.3g} m"
+        if heights & {*replays_without}
+        else ""
+    )
     give_up_note = (
-        "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
-        "while the replay dead-reckons"
+        "; without a horizontal aiding source EKF2 stops providing a position after "
+        "EKF2_NOAID_TOUT (5 s), while the replay dead-reckons"
     )
     at_s = difference.index[distance.argmax()]
     return (
-        f"Without {aids_text} the published position differs from the replay as flown by at most "
-        f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
+        f"Without {aids_text} the published position differs from the replay with all aiding "
+        f"sources by at most {distance.max():.3g} m (at {at_s:.1f} s), and by "
+        f"{distance[-1]:.3g} m at the end{height}"
         + (give_up_note if horizontal_aids <= replays_without.keys() else "")
     )
 
@@ -613,7 +620,8 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.uses_delay_as_horizon else ": raise EKF2_DELAY_MAX"
-        # EKF2 fuses only the newer of two samples in a prediction step: updates may be fewer
+        # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
+        # prediction step
         samples = max(len(replay.updates), replay.late) + replay.lost
         yield (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "

@@ -1,1 +1,1 @@
-"""KF: model, signals, replay, likelihood and consistency; estimates of noises and time offset."""
+"""KF: model, input, run, likelihood and consistency; estimates of noises and time offset."""

@@ -34,9 +34,9 @@ MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Number of lags of the Ljung-Box whiteness test
 LJUNG_BOX_LAGS = 10
-# Ratios of actual to reported σ of a consistent filter. Against ground truth, the ratio of EKF2
-# is 0.84 to 1.22 in simulated flights without faults, because its σ excludes the lag of its output
-# predictor
+# Range of the ratio of actual to reported σ in which a filter is consistent, against the position
+# source and against ground truth. Against ground truth, the ratio of EKF2 is 0.84 to 1.22 in
+# simulated flights without faults, because the σ of EKF2 excludes the lag of the output predictor
 Reference = Literal["source", "truth"]
 CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
@@ -120,7 +120,8 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
-    shape = 0.5 * count * dimensions  # of the gamma distribution of half of the summed NIS
+    # half of the sum of all NIS has a gamma distribution with this shape parameter
+    shape = 0.5 * count * dimensions
     low, high = (
         float(gammaincinv(shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / shape for sign in (-1, 1)
     )

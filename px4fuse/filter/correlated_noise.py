@@ -40,48 +40,53 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Maximum number of measurements, to limit the computing time: only the middle of a longer flight is
-# used
+# Maximum number of position measurements in the fits: of a longer flight only the middle is used,
+# to limit the computing time
 MAX_MEASUREMENTS = 2000
-# Maximum interval between positions that a low pass correlates, in median intervals: correlation
-# over longer intervals is negligible
+# Maximum ratio of the interval between two positions to the median interval, for a low pass to
+# correlate the two positions: over a longer interval the correlation is negligible
 MAX_INTERVAL_RATIO = 3.0
-# Time constants (s) of the coarse search for time-correlated noise
+# Time constants (s) in the coarse search for time-correlated noise, which finds the initial values
+# of the full fit
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Time-correlated fractions of the variance SIGMA_Z² in the coarse search
+# Fractions of the variance SIGMA_Z² that are time-correlated noise in the coarse search
 COARSE_VARIANCE_SHARES = (0.12, 0.35, 0.8)
-# Factors on SIGMA_A in the coarse search
+# Factors on SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Factors on all noises together in the coarse search
+# Factors by which all noises are multiplied together in the coarse search
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
-# Approximate number of measurements in the coarse search
+# Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search: below, there is no full fit
+# Minimum gain of log-likelihood over white noise in the coarse search, for a full fit of
+# time-correlated noise
 MIN_COARSE_GAIN_NATS = 0.5
-# Maximum noise (m) of positions that are so smooth that a low pass is fitted in any case
+# Maximum SIGMA_Z (m) for fitting a low pass without significant time-correlated noise: such smooth
+# positions are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
-# Minimum gain of log-likelihood over white noise in the full fit
+# Minimum gain of log-likelihood over white noise in the full fit, for significant time-correlated
+# noise
 MIN_GAIN_NATS = 2.0
-# Penalty on the log-likelihood of time-correlated noise with a time offset, compared with a low
-# pass: 1 for each of two additional parameters (Akaike 1974)
+# Penalty (nats) on the log-likelihood of time-correlated noise with shifted timestamps, compared
+# with a low pass: 1 for each of two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_S = (0.02, 3.0)
-# Tolerance of ln τ of a low pass
+# Tolerance of ln τ in the search for the time constant τ of a low pass
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of measurements in the fit to ground truth, to limit the computing time
+# Maximum number of position errors against ground truth in the fit of time-correlated noise, to
+# limit the computing time
 MAX_TRUTH_MEASUREMENTS = 300
-# Minimum gain of log-likelihood over white noise in the fit to ground truth: likelihood ratio 150,
-# for two more parameters
+# Minimum gain of log-likelihood over white noise for accepting the fit to ground truth: a
+# likelihood ratio of 150 for two more parameters
 MIN_TRUTH_GAIN_NATS = 5.0
-# Maximum time (s) from a measurement to a sample of ground truth: at 2 m/s² the interpolation error
-# is then 1 cm
+# Maximum time (s) between a measurement and the nearest sample of ground truth: at 2 m/s² the
+# interpolation error is then 1 cm
 MAX_TRUTH_DISTANCE_S = 0.1
 # Number of parts of the flight with separate time offsets in the fit to ground truth
 OFFSET_PART_COUNT = 12
-# Time constants (s) of the fit to ground truth
+# Time constants (s) of the noise that are tested in the fit to ground truth
 TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
-# Time-correlated fractions of the error variance in the fit to ground truth
+# Time-correlated fractions of the error variance that are tested in the fit to ground truth
 CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
@@ -155,7 +160,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     axes : tuple of Axis
         Axes with the same measurement times.
     settings : Settings
-        Only ``dt_s`` is used: SIGMA_A refers to it.
+        Only ``dt_s`` is used, the interval for which SIGMA_A is defined.
     noises : Noises
         Initial values: estimates of the model with white noise.
     outlier_time_s : ndarray
@@ -167,7 +172,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
-        return too_few_measurements("time-correlated errors", len(time_s), MIN_MEASUREMENTS)
+        return too_few_measurements(
+            "time correlation of the position errors", len(time_s), MIN_MEASUREMENTS
+        )
     first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
     rows = slice(first_row, first_row + MAX_MEASUREMENTS)
     time_s = time_s[rows]
@@ -185,13 +192,13 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     signals = SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Return the positions before a low pass, and -ln of the Jacobian of its inverse."""
+        """Return the positions before the low pass, and -ln of the Jacobian of the inverse."""
         rho = np.zeros(len(time_s))
         if tau_s:
             rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # inverting the low-pass filter spreads an outlier to the next position: both are excluded
+        # the inverse of the low pass spreads an outlier to the next position, so both are excluded
         is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
         prepared_motion = prepare_motion(
             flight,
@@ -203,7 +210,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the first position of an IMU segment sets the initial state, so it has no likelihood
+        # the first position of an IMU segment sets the initial state and does not contribute to the
+        # likelihood
         is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
@@ -227,8 +235,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         _best_of_grid(coarse_motion, offsets, candidate_noises)
         for candidate_noises in ([noises], correlated_noises)
     )
-    label = "time-correlated noise of the source"
-    no_correlation = Unavailable(label, "its errors are not time-correlated", "")
+    no_correlation = Unavailable(
+        "time-correlated noise of the positions", "the position errors are not time-correlated", ""
+    )
     is_smooth = sigma_z_m < MAX_SMOOTH_SIGMA_M
     if white_score - correlated_score < MIN_COARSE_GAIN_NATS and not is_smooth:
         return low_pass, no_correlation
@@ -249,7 +258,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # always available: the white-noise model used the same measurements
+        # prepare_motion succeeded for the white-noise model with the same measurements
         assert not isinstance(prepared_motion, Unavailable)
         fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
         return fit.lowest_score + jacobian_term, fit.noises
@@ -302,7 +311,7 @@ def fit_time_correlation_to_truth(
     truths : sequence of DataFrame
         Ground truth with the column ``position_m``, along each axis.
     imu_fit, low_pass
-        Results of :func:`fit_time_correlation`, with the ``lag_nats`` of the result.
+        Results of :func:`fit_time_correlation`, from which ``lag_nats`` is copied.
     """
     min_gain = MIN_TRUTH_GAIN_NATS
     lag_nats = low_pass.gain_nats
@@ -332,7 +341,7 @@ def fit_time_correlation_to_truth(
         :, nuisance_columns.shape[1] :
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
-    shares = CORRELATED_FRACTIONS
+    fractions = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
@@ -340,23 +349,24 @@ def fit_time_correlation_to_truth(
             residual_basis.T @ np.exp(-np.abs(time[:, None] - time) / tau) @ residual_basis
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation)
-        variance = 1.0 - shares + shares * eigenvalues[:, None]
+        variance = 1.0 - fractions + fractions * eigenvalues[:, None]
         mean_square = ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / variance) / len(residuals)
         score = half_counts @ [np.log(variance).sum(axis=0), np.log(mean_square).sum(axis=0)]
         grid_scores.append((score, mean_square.mean(axis=0)))
-    score, mean_square = np.transpose(grid_scores, (1, 0, 2))  # shape (time constants, shares)
-    tau_index, share_index = divmod(int(np.argmin(score)), len(shares))
+    # both have the shape (time constants, correlated fractions)
+    score, mean_square = np.transpose(grid_scores, (1, 0, 2))
+    tau_index, fraction_index = divmod(int(np.argmin(score)), len(fractions))
     gain = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - score.min(axis=1)
     if gain.max() < min_gain:
         return imu_fit
     first_tau, last_tau = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
     # the 95 % interval ends between grid points, so the next outer grid points are returned
     tau_s = np.append(TRUTH_TAUS_S, np.inf)[[tau_index, max(first_tau - 1, 0), last_tau + 1]]
-    sizes_m = np.sqrt(
-        mean_square[tau_index, share_index]
-        * np.array([shares[share_index], 1.0 - shares[share_index]])
+    sigmas_m = np.sqrt(
+        mean_square[tau_index, fraction_index]
+        * np.array([fractions[fraction_index], 1.0 - fractions[fraction_index]])
     )
-    return TimeCorrelatedNoise(*np.r_[tau_s, sizes_m, gain.max(), lag_nats].tolist())
+    return TimeCorrelatedNoise(*np.r_[tau_s, sigmas_m, gain.max(), lag_nats].tolist())
 
 
 def _fit_noises_at(

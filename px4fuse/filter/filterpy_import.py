@@ -17,7 +17,8 @@ class _LazyDistribution:
 
     def __getattr__(self, attribute: str) -> Any:
         stats = import_module("scipy.stats")
-        if stats.__spec__ is None:  # the stand-in: filterpy calls logpdf once when it is imported
+        # during its import, filterpy calls logpdf of the module that replaces scipy.stats
+        if stats.__spec__ is None:
             return lambda *_, **__: 0.0
         return getattr(getattr(stats, self._name), attribute)
 

@@ -28,9 +28,9 @@ from px4fuse.filter.marginal_likelihood import (
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
-# Search range of the acceleration noise
+# Search range (m/s²) of SIGMA_A
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
-# Search range of the measurement noise: no positioning system is better than 1 mm
+# Search range (m) of SIGMA_Z: no positioning system is better than 1 mm
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
@@ -46,17 +46,19 @@ START_OUTLIER_SHARE = 0.005
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_SHARE = 0.4
-# Maximum ratio of SIGMA_Z to its estimate from the median of the squared errors
+# Maximum ratio of SIGMA_Z to the robust estimate from the median of the squared errors, while
+# outliers are estimated
 MAX_SIGMA_Z_RATIO = 1.2
-# Maximum change of an outlier probability in the last iteration
+# Maximum change of an outlier probability in the last iteration of expectation maximisation
 MAX_PROBABILITY_CHANGE = 0.01
 # Value used as -ln p per measurement if -ln p cannot be computed: larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number of nodes of the interpolated likelihood, and their distance in ln σ
+# Number of nodes for polynomial interpolation of the likelihood, and distance of the nodes in ln σ
 LIKELIHOOD_NODES = 10, 0.25
-# The same while the outlier probabilities still change: an approximate maximum is then sufficient
+# Number and distance in ln σ of the interpolation nodes while the outlier probabilities still
+# change: an approximate maximum of the likelihood is then sufficient
 COARSE_LIKELIHOOD_NODES = 6, 0.2
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
@@ -83,7 +85,7 @@ class Noises:
     tau_s: float = 0.0
 
 
-# Search range of each noise, by field of Noises
+# Search range of each field of Noises, in the unit of the field
 SEARCH_RANGES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
     "sigma_z_m": SIGMA_Z_SEARCH_M,
@@ -96,8 +98,8 @@ SEARCH_RANGES = {
 class Likelihood:
     """Negative log-likelihood of the measurements (without a constant) as a function of the noises.
 
-    With acceleration and measurement noise only, it is a smooth function of ln(SIGMA_A/SIGMA_Z) and
-    ln SIGMA_Z. The function is computed on demand at nodes and interpolated with polynomials. The
+    Without random walk and correlated noise, -ln p is a smooth function of ln(SIGMA_A/SIGMA_Z) and
+    ln SIGMA_Z. This function is computed on demand at nodes and interpolated with polynomials. The
     singularities of the function are π/2 from the real axis, so the interpolation error is at the
     level of rounding.
 
@@ -108,7 +110,7 @@ class Likelihood:
     weight : ndarray, shape (m,)
         Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
-        Approximate SIGMA_Z, to which the limit for a known initial state is relative.
+        Approximate SIGMA_Z: an initial state is known if its prior σ is small compared with it.
     is_coarse : bool
         True to interpolate between fewer nodes, if an approximate maximum is sufficient.
     """
@@ -200,6 +202,7 @@ def fit_ratios(
     weight : ndarray, shape (m,)
         Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
+        SIGMA_Z, the unit of all noises.
     """
     scaled_batches = (
         positions.in_sigma_z_units(sigma_z_m, random_walk, weight) for positions in position_batches
@@ -271,7 +274,7 @@ class NoiseFit:
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """Convert the input of KF to positions with unknown constants: errors of KF's initial state."""
+    """Convert the input of KF to positions with an unknown error of the initial state."""
     count = len(intervals.measurement_m)
     prior_precision = np.zeros((count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
@@ -323,9 +326,10 @@ def maximise_likelihood(
             likelihood, noises, COARSE_MAX_ITERATIONS if iteration else MAX_ITERATIONS
         )
         squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
-        # outliers increase the estimated SIGMA_Z, which would hide them; the median is robust
+        # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
+        # the median
         median_square = float(np.median(squares / count) / (chdtri(count[0], 0.5) / count[0]))
-        # noise above the search range is not due to outliers
+        # if the median error is above the search range, large errors are noise, not outliers
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
@@ -415,7 +419,8 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # with hardly any outlier the information is singular, and the outliers add no uncertainty
+    # if the data have hardly any outliers, the information matrix is singular, and the uncertainty
+    # of the outliers is negligible
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
@@ -429,10 +434,11 @@ def _maximise_by_gradient(
     count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
-        # -ln p per measurement limits the first step of L-BFGS-B to about 1
+        # a score per measurement limits the first step of L-BFGS-B to about 1
         try:
             return likelihood(to_noises(logs)) / count
-        # far from the maximum rounding errors dominate: a large value shortens the search step
+        # far from the maximum rounding errors dominate; the large value makes L-BFGS-B shorten the
+        # step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

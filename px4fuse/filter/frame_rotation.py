@@ -30,39 +30,45 @@ from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# Length (s) of the parts of the flight whose headings are compared, with a measured orientation
+# Length (s) of the parts of the flight in which the headings of source and EKF2 are compared, if
+# the source measures an orientation
 PART_LENGTH_S = 2.0
-# Length (s) of the parts of the flight with separate heading errors, without a measured orientation
+# Length (s) of the parts of the flight in which a heading error is estimated, if the source
+# measures no orientation
 POSITION_PART_LENGTH_S = 15.0
-# Minimum length (s) of a part without a measured orientation, between gaps of the IMU
+# Minimum length (s) of a part of the flight, between IMU gaps, for estimating a heading error from
+# positions
 MIN_POSITION_PART_S = 5.0
-# Minimum number of parts of the flight for a comparison of orientations
+# Minimum number of parts of the flight for comparing the headings of source and EKF2
 MIN_PARTS = 3
-# Minimum number of positions for an estimate without a measured orientation
+# Minimum number of positions for estimating the heading error from positions
 MIN_MEASUREMENTS = 50
-# Minimum number of samples in a part of the flight
+# Minimum number of orientation samples in a part of the flight
 MIN_PART_SAMPLES = 3
-# Maximum number of measurements; longer tracks are downsampled: more measurements take time and
+# Maximum number of positions: longer tracks are downsampled, because more positions take time and
 # hardly improve the heading
 MAX_MEASUREMENTS = 1000
 # Maximum p-value of the hypothesis "constant heading error" for reporting a change in flight
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum change (°) of the heading error in flight for reporting the change
 MIN_DRIFT_DEG = 5.5
-# Maximum yaw rate at which the headings of source and EKF2 are compared: at a higher rate, a delay
-# of 0.2 s would look like a heading error of more than 2°
+# Maximum yaw rate (°/s) at which the headings of source and EKF2 are compared: at a higher rate, a
+# delay of 0.2 s would look like a heading error of more than 2°
 MAX_YAW_RATE_DEG_S = 10.0
-# Minimum σ of a heading difference between source and EKF2, for mounting, vibration and rounding
+# Minimum σ (°) of a heading difference between source and EKF2: allows for mounting, vibration and
+# rounding
 MIN_SIGMA_DEG = 0.5
-# Maximum median interval between logged attitudes
+# Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of fits, each linearised about the result of the previous fit
+# Maximum number of linearised fits of the heading error; each fit starts at the previous result
 MAX_LINEARISATIONS = 5
-# Maximum change of the rotation by the last fit
+# Maximum change (rad) of the heading error in the last fit: with a smaller change the fits have
+# converged
 MAX_FINAL_STEP_RAD = 0.01
-# Prior σ of the heading error at the start of a part: wide, because the frame may be misaligned
+# Prior σ (rad) of the heading error at the start of a part: wide, because the frame may be
+# misaligned
 HEADING_SIGMA_RAD = 1.0
-# Minimum ratio of the motion from the IMU to the motion of the positions
+# Minimum ratio of IMU motion to position motion: the heading error is divided by this ratio
 MIN_SCALE = 0.1
 # Index of the heading error among the unknown constants of a part of the flight
 HEADING_CONSTANT = 2
@@ -146,7 +152,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     track : PositionTrack
     segment : Segment
     settings : Settings
-        ``dt_s``, to which SIGMA_A refers, and the initial value of SIGMA_A.
+        ``dt_s``, the interval for which SIGMA_A is defined, and the initial value of SIGMA_A.
     sigma_z_m : float
         Initial value of the position noise.
     offset_s : float
@@ -181,8 +187,8 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
     noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
-    # orientations give no absolute angle, because the mounting angle of the source is unknown, but
-    # a constant difference of the headings shows that the misalignment is constant
+    # orientations do not give the misalignment, because the mounting angle of the source is
+    # unknown; but if the headings have a constant difference, the misalignment is constant
     return _estimate_from_positions(
         flight, samples, noises, settings.dt_s, is_constant=orientation_result is not None
     )
@@ -190,7 +196,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
     """Average rotation and σ (rad) over parts of equal duration; convert to degrees."""
-    # parts of a long, downsampled track may be longer, to contain enough samples
+    # parts of a long, downsampled track may exceed PART_LENGTH_S, to contain enough samples
     count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
@@ -279,12 +285,12 @@ def _estimate_from_positions(
         if not is_long.any():
             return Unavailable(
                 "heading error",
-                f"no part of the flight without IMU gap is {MIN_POSITION_PART_S:g} s long",
+                f"all parts between gaps of the IMU are shorter than {MIN_POSITION_PART_S:g} s",
                 "Analyse a longer segment.",
             )
         positions = motion.at(0.0)
-        # the sensitivity to the scale is the path without IMU noise; noise in the sensitivity to
-        # the heading would reduce the estimate (errors in variables)
+        # the path without IMU noise is used for both sensitivities: noise in the sensitivity to the
+        # heading would bias the estimate to zero (errors in variables)
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_CONSTANT] = -east_m, north_m
@@ -301,10 +307,11 @@ def _estimate_from_positions(
         if abs(step_rad) < MAX_FINAL_STEP_RAD:
             break
     difference_rad = error_rad - step_rad
-    # variance of the heading error itself: variance of the estimates minus their σ²
+    # variance of the heading error in flight: variance of the estimates minus the variance of their
+    # errors
     excess_variance = max(float(np.mean(difference_rad**2 - variance)), 0.0)
     drift_variance = 0.0 if is_constant else excess_variance
-    # estimates are moved towards their mean by the fraction of their variance that is noise
+    # each estimate moves towards the mean by the fraction of its variance that is estimation error
     drift_fraction = drift_variance / (drift_variance + variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [

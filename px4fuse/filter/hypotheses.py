@@ -41,23 +41,24 @@ from px4fuse.filter.signals import Acceleration, Axis, too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight.model import Columns, Flight, Unavailable
 
-ANALYSIS_NAME = "causes beyond noise"
+ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50
-# RMS of the slow tilt error of the logged attitude
+# Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_SIGMA_RAD = 0.002
-# Interval (s) between the knots of the slow acceleration error, which is linear between knots
+# Interval (s) between the knots of the slow acceleration error, which is interpolated linearly
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
-# Columns of the design matrix: accelerometer biases forward and right, rotation of the frame
+# Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Grid of factors on KF's SIGMA_A: less acceleration noise remains after biases and tilt are fitted
+# Factors on KF's SIGMA_A that are tested: with fitted biases and tilt, the acceleration noise is
+# smaller
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
-# Number of jump times that are tested together, to limit memory
+# Number of possible jump times that are tested in one computation, to limit memory
 STEP_BATCH_SIZE = 200
 # Time (s) after a jump in which measurements are ignored, so that a burst of outliers is not
 # detected as a jump
@@ -69,7 +70,7 @@ OUTLIERS_AFTER_STEP_S = 6.0
 MAX_STEP_FALSE_ALARM_P = 1e-3
 # Maximum probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of times that are compared to locate a jump
+# Maximum number of possible jump times that are compared to find the exact time of a jump
 MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias for a finding: half of EKF2's limit EKF2_ABL_LIM
@@ -164,7 +165,7 @@ def fit_bias_scale_jumps(
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
     settings : Settings
-        Only ``dt_s`` is used, to which SIGMA_A refers.
+        Only ``dt_s`` is used, the interval for which SIGMA_A is defined.
     sigma_a_m_s2, sigma_z_m : float
         KF's maximum-likelihood noises.
     outlier_time_s : ndarray
@@ -244,15 +245,16 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Tested times are announced ones, the best of a scan over all times, and the starts of runs of
-    outliers: the first measurements after a jump look like outliers. Each time is tested without
-    the measurements of the next second, so that a burst of outliers is not detected as a jump. The
-    exact time is determined last, because the length of the jump depends on it.
+    A jump is tested at the announced times, at the best time of a scan over all times, and at the
+    start of each run of outliers: the first measurements after a jump look like outliers. Each test
+    ignores the measurements of the next second, so that a burst of outliers is not detected as a
+    jump. The exact time is determined last, because the length of the jump depends on it.
     """
     jumps: list[Jump] = []
 
     def skip_near(jump_s: float) -> BoolArray:
-        if jump_s in announced_s:  # the data after the jump are no burst of outliers
+        # an announced jump is no burst of outliers, so the positions after it are used
+        if jump_s in announced_s:
             return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIERS_AFTER_STEP_S)
         return is_skipped | _is_in_window(design.time_s, jump_s, OUTLIER_BURST_S)
 
@@ -335,7 +337,7 @@ def _locate_jump(
 ) -> tuple[Jump, BoolArray]:
     """Find the exact time and the length of a detected jump; return also a mask of outliers."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # exclude measurements close to the jump; use later outliers again if they agree with the jump
+    # exclude the measurements near the jump; use later outliers again if they agree with the jump
     chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
     is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
     threshold = chdtri(design.axis_count, MAX_FALSE_OUTLIER_P)
@@ -348,7 +350,7 @@ def _locate_jump(
     for jump_s in times[best_indices].tolist():
         chi_square = design.with_step(jump_s)[0].residual_squares(sigma_a, is_skipped | is_near)
         outliers_by_time[jump_s] = np.where(is_near, chi_square > threshold, is_skipped)
-    # a wrong jump time makes good measurements outliers: choose the time with the fewest outliers
+    # with a wrong jump time, good measurements look like outliers: choose the time with the fewest
     time_s = min(outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s]))
     is_skipped = outliers_by_time[time_s]
     stepped_design, columns = design.with_step(time_s)
@@ -360,7 +362,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Test a jump without the skipped data; return None if it is not significant."""
+    """Test a jump without the skipped measurements; return None if the jump is not significant."""
     design, columns = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
@@ -471,7 +473,7 @@ class DesignMatrix:
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
         """Fit all columns, with a scale factor on the acceleration and on its noise.
 
-        ``is_skipped`` are the measurements to exclude from filter and fit, shape (m,).
+        ``is_skipped``, shape (m,), is True for measurements that filter and fit exclude.
         """
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
@@ -488,7 +490,8 @@ class DesignMatrix:
         count = columns.shape[1]
         prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # a small diagonal keeps the matrix regular if a column is zero, as the rotation in hover
+        # a small diagonal keeps the matrix regular if a column is zero, as the frame rotation in
+        # hover
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
         moment = columns.T @ data
         factor = cho_factor(information)
@@ -597,7 +600,7 @@ def make_design_matrix(
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
-        # one filter for all axes: in gaps of the IMU with the mean of their process noises
+        # all axes share one process noise: in gaps of the IMU, the mean over the axes
         noise_fixed=np.mean([each.noise_fixed for each in axis_inputs], axis=0),
         initial=replace(axis_inputs[0].initial, position_m=0.0),
     )

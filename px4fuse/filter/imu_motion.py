@@ -33,7 +33,7 @@ from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
 
-# Prior σ (rad) of the tilt and heading at the start of a segment
+# Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
@@ -43,7 +43,7 @@ CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 MAX_SEGMENT_S = 30.0
 # Largest time offset (s) of the search
 MAX_OFFSET_S = 0.6
-# Number of time offsets in the coarse search
+# Number of time offsets in the coarse search over the whole range
 COARSE_OFFSETS = 25
 # Approximate number of measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
@@ -90,7 +90,7 @@ class Signals:
         return position, velocity
 
 
-# Signals of one flight by time span (s), for reuse
+# Signals that were computed for a flight, by time span (s)
 SignalCache = dict[Span, Signals]
 
 
@@ -113,7 +113,7 @@ class PreparedMotion:
     directions : ndarray, shape (a, 3)
         Unit vectors of the axes in NED.
     dt_s : float
-        DT, to which SIGMA_A refers.
+        DT, the interval for which SIGMA_A is defined.
     imu_interval_s : float
     heading_sigma_rad : float
         Prior σ of the heading at the start of a segment.
@@ -130,7 +130,7 @@ class PreparedMotion:
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, count: int) -> PreparedMotion:
-        """Keep about ``count`` of the measurements; all if these would be too few per segment."""
+        """Keep about ``count`` measurements, or all if too few would remain in every segment."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
         keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
@@ -153,7 +153,7 @@ class PreparedMotion:
         dp, dv = np.zeros((2, *shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
             time = self.time_s[begin:end]
-            # shape (axes, offsets, constants, times)
+            # both arrays have the shape (axes, time offsets, constants, times)
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in signals.at(time + offset_s[:, None])
@@ -283,7 +283,8 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # relative positions are small, which limits rounding errors; initial positions are unknown
+    # positions relative to the first one of the segment are small, which limits rounding errors;
+    # the initial position is an unknown of the fit
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
     first_m = measured_m.groupby(segment_index).transform("first")

@@ -26,7 +26,7 @@ from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import make_timeline
 
 Rows = list[tuple[float, ...]]
-# Columns of ``Replay.updates``
+# Columns of the table ``Replay.updates``, which has one row per measurement
 UPDATE_COLUMNS = [
     "measurement_m",
     "innovation_m",
@@ -153,7 +153,7 @@ def _run_filterpy(
 def _run_floats(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[Rows, Rows]:
-    """Predict and update KF with floats; arguments and results of :func:`_run_filterpy`."""
+    """Predict and update KF with floats; arguments and results as in :func:`_run_filterpy`."""
     position, velocity, covariance = (
         initial.position_m,
         initial.velocity_m_s,

@@ -34,9 +34,10 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Maximum change of the other parameter's logarithm between two points of a likelihood profile
+# Maximum change of the other noise's logarithm between two points of a likelihood profile, which is
+# maximised over the other noise (for example SIGMA_Z in the profile of SIGMA_A)
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of the other parameter's logarithm at each point of a likelihood profile
+# Tolerance of the other noise's logarithm at each point of a likelihood profile
 OTHER_LOG_TOLERANCE = 2e-3
 
 
@@ -308,9 +309,8 @@ def profile_ends(
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
-        # square root of the drop of the log-likelihood, which is nearly linear in the distance from
-        # the maximum, minus its value at the end of the interval. The search for the other
-        # parameter starts at the previous result
+        # the square root of the drop of the log-likelihood is nearly linear in the distance from
+        # the maximum; the search for the other parameter starts at the previous result
         @cache
         def excess(distance: float) -> float:
             nonlocal other_log

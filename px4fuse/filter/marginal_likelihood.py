@@ -35,12 +35,12 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNIT_SCALE = np.ones(1)
 # SIGMA_A (m/s²) and SIGMA_Z (m) of the smooth path that is subtracted from the positions
 PATH_NOISES = 0.5, 0.1
-# Minimum precision (1/m²) of a known initial position
+# Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise of an interval, relative to the measurement noise and to the interval's Q:
 # it makes Q invertible if Q is from a single step (rank one) or zero
 MIN_NOISE_SHARE = 1e-5
-# Number of signals that are computed together: more need more memory and are not faster
+# Number of signals that are computed together: more signals need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
 # Minimum determinant of Q, relative to the product of the diagonal of Q: smaller values are
 # rounding errors
@@ -460,7 +460,7 @@ class BandedSystem:
         The right-hand side has the shape (signals, states · m).
         """
         i00, i01, _ = self.inverse_q
-        # Q⁻¹ = UᵀU; zero between segments
+        # U of Q⁻¹ = UᵀU; both are zero between segments
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
         whitened_0 = u00 * dp + u01 * dv
@@ -489,7 +489,7 @@ class BandedSystem:
         states. Both are blocks of Cholesky factors: of A, and of A in reversed order (Fraser and
         Potter 1969).
         """
-        # A with reversed rows and columns
+        # reverse the order of the rows and columns of A
         reversed_bands = np.zeros_like(self.bands)
         size = self.bands.shape[1]
         for below in range(4):
@@ -582,7 +582,7 @@ def factorise(
     bands = columns.reshape(-1, state_count + 2).T
     lower, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
-        raise np.linalg.LinAlgError("a segment has too few position measurements")
+        raise np.linalg.LinAlgError("a segment has too few positions to determine an initial state")
     log_lower = 2.0 * np.sum(np.log(lower[0]))
     log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
     inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)

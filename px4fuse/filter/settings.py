@@ -8,7 +8,7 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Valid ranges of KF's settings: values outside are typing errors
+# Valid ranges of KF's settings: a value outside is a typing error
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
@@ -50,7 +50,7 @@ class Settings:
     def __post_init__(self) -> None:
         for (name, unit), (low, high) in zip(SETTING_UNITS.items(), _RANGES, strict=True):
             value = getattr(self, name)
-            if not low <= value <= high:  # also rejects NaN
+            if not low <= value <= high:  # also True for NaN
                 raise SettingsError(
                     f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )

@@ -25,7 +25,8 @@ from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Una
 AISLE = "aisle"
 # Maximum interval (s) between IMU samples: a longer interval is a gap
 IMU_GAP_S = 0.1
-# Maximum interval between IMU samples in median intervals: a longer interval is a gap
+# Maximum ratio of an interval between IMU samples to the median interval: a longer interval is a
+# gap
 IMU_GAP_INTERVALS = 5.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -35,8 +36,8 @@ MIN_MEASUREMENTS = 3
 class Segment:
     """Analysed part of a flight: start and end (s), and the reason for choosing it.
 
-    ``flight_s`` also contains the times in flight (or chosen) before and after it, which have no
-    positions; None if there are none.
+    ``flight_s`` is the time span (s) from take-off to landing, or as the user chose it, including
+    times without positions. None if it equals start and end.
     """
 
     start_s: float
@@ -46,7 +47,7 @@ class Segment:
 
     @property
     def flight(self) -> Segment:
-        """Segment with the times without positions before and after it."""
+        """Segment extended to ``flight_s``, which includes times without positions."""
         return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
@@ -134,7 +135,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
         return Unavailable(
             "acceleration in NED",
             "IMU and attitude data do not overlap in time",
-            "Log both from boot (SDLOG_MODE 1).",
+            "Log from boot (SDLOG_MODE 1).",
         )
     return imu, attitude
 
@@ -215,7 +216,7 @@ def make_axes(
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown_names := [name for name in axis_names if name not in valid_names]:
         raise SettingsError(
-            f"Axis {unknown_names[0]} is not known.",
+            f"px4fuse has no axis {unknown_names[0]}.",
             f"Choose from the axes {', '.join(valid_names)}.",
         )
     source_label = f"{flight.log.name}: {track.name}"
@@ -231,12 +232,14 @@ def make_axes(
         if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
                 continue
-            raise MissingDataError(f"{source_label} has no position along {name} in this segment.")
+            raise MissingDataError(
+                f"{source_label} has no position along the axis {name} in the analysed segment."
+            )
         projected_acceleration = project_acceleration(acceleration, direction, segment)
         measurements = samples.index.to_numpy()[is_finite], projected[is_finite]
         axes.append(Axis(name, direction, heading, note, *measurements, projected_acceleration))
     if not axes:
-        raise MissingDataError(f"{source_label} has no finite position in this segment.")
+        raise MissingDataError(f"{source_label} has no finite position in the analysed segment.")
     return tuple(axes)
 
 
@@ -266,10 +269,10 @@ def _axis_direction(
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
     if heading_deg is None:
         axis_heading_deg, elongation = aisle_heading(track, segment)
-        note = f"main direction of the track, length / width {elongation:.1f}"
+        note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
     else:
         axis_heading_deg = heading_deg
-        note = "heading from the option --heading"
+        note = "heading of the option --heading"
     angle_rad = np.radians(axis_heading_deg)
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
 
@@ -290,8 +293,8 @@ def project_acceleration(
     if np.count_nonzero(is_inside) < 2:
         return Unavailable(
             "IMU",
-            "no IMU samples in the analysed segment",
-            "Choose --start and --end within the IMU data.",
+            "the analysed segment contains no IMU samples",
+            "Use --start and --end to choose a segment with IMU samples.",
         )
     is_gap = imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)

@@ -10,7 +10,8 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight.model import Unavailable
 
-# Maximum difference (s) of two equal timestamps: timestamps have a resolution of 1 µs
+# Maximum difference (s) between two timestamps that are treated as equal: timestamps have a
+# resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
@@ -54,10 +55,12 @@ def make_timeline(
     is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S
     measured_s = axis.measurement_time_s[is_usable]
     if not len(measured_s):
-        raise SettingsError(f"axis {axis.name}: no measurement after the start at {start_s:.2f} s.")
+        raise SettingsError(
+            f"Axis {axis.name} has no position after the initial time of KF, {start_s:.2f} s."
+        )
     count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(count)
-    # the timestamp of a measurement replaces an equal time of the grid
+    # a measurement at a time of the DT grid replaces the grid time
     next_index = np.searchsorted(measured_s, grid_s)
     neighbours = np.clip([next_index - 1, next_index], 0, len(measured_s) - 1)
     distance_s = np.abs(measured_s[neighbours] - grid_s).min(axis=0)
@@ -70,7 +73,9 @@ def make_timeline(
     if settings.input == "zero":
         return Timeline(time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0)
     if isinstance(axis.acceleration, Unavailable):
-        raise SettingsError("`input` imu needs an acceleration", f"{axis.acceleration}")
+        raise SettingsError(
+            "With the setting `input` imu, KF needs IMU data.", f"{axis.acceleration}"
+        )
     mean_m_s2, gap_fraction = step_means(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
     # In a gap of T seconds the unknown acceleration is assumed constant. The velocity error is then

@@ -53,11 +53,12 @@ MAX_HALF_INTERVAL_S = 0.15
 MAX_PART_SIGMA_S = 0.15
 # Maximum p-value of the hypothesis "constant time offset" for reporting a change in flight
 MAX_CHANGE_P = 0.005
-# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
+# Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_CHANGE_S = 0.10
-# Minimum significant time offset, in σ (false alarm probability 0.3 %), and in s: at 1 m/s a third
-# of the noise of good UWB (0.1 m)
-MIN_OFFSET_SIGMAS, MIN_OFFSET_S = 3.0, 0.03
+# Minimum time offset, in σ, to be significant: false alarm probability 0.3 %
+MIN_OFFSET_SIGMAS = 3.0
+# Minimum time offset (s) to be significant: at 1 m/s a third of the noise of good UWB (0.1 m)
+MIN_OFFSET_S = 0.03
 # Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
 # Step of ln σ for numerical derivatives of the likelihood with respect to the noises
@@ -174,13 +175,14 @@ def estimate_time_offset(
         Track with the logged timestamps.
     segment : Segment
     settings : Settings
-        Only ``clock_offset_s`` and ``dt_s`` are used; SIGMA_A refers to ``dt_s``.
+        Only ``clock_offset_s`` and ``dt_s`` (the interval for which SIGMA_A is defined) are used.
     noises : Noises
         Initial values for a model with biases. The random walk is not zero if the source may drift
         (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
     progress : callable
+        Called with the name of each step of the analysis.
     signals : dict, optional
         IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
 
@@ -188,7 +190,7 @@ def estimate_time_offset(
     -------
     ClockOffset, or Unavailable without IMU or attitude or with too few measurements.
     """
-    # GNSS is noisier vertically, and all axes share one SIGMA_Z
+    # the height of GNSS is not used: it is noisier, and all axes share one SIGMA_Z
     axes = 2 if track.origin.is_gnss else 3
     samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
@@ -241,13 +243,13 @@ def estimate_time_offset(
     reason = ""
     if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
         reason = (
-            f"offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: too "
-            "little acceleration, or too much position noise"
+            f"time offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: "
+            "the flight has too little acceleration, or the positions have too much noise"
         )
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not reason:
-        progress("changes of the time offset")
+        progress("changes of the time offset in flight")
         parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_s = settings.clock_offset_s
@@ -311,7 +313,8 @@ def _profile_over_noises(
     mixed = scores_at(1, 1)[-1] + scores_at(-1, -1)[-1] - 2.0 * centre[-1]
     hessian[0, 1] = hessian[1, 0] = 0.5 * (mixed - hessian[0, 0] - hessian[1, 1])
     hessian /= LOG_SIGMA_STEP**2
-    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A is at the end of its search range
+    # if SIGMA_A is at an end of the search range, the Hessian allows no Newton step
+    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):
         return centre[:-1]
     gain = 0.5 * np.einsum("it,ij,jt->t", gradient, np.linalg.inv(hessian), gradient)
     return np.asarray(centre[:-1] - gain)
@@ -342,11 +345,12 @@ def _simulate_variance_factor(
     dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
     error_m = noises.sigma_z_m * draw_normal(count)
-    # velocity noise accumulates from the start of each segment
+    # the velocity noise is the sum of the increments since the start of the segment
     velocity_noise = np.zeros_like(error_m)
     for begin, end in positions.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    if noises.random_walk_m:  # random walk of the source: only in the residuals, not in the IMU
+    # the random walk of the source is added after the velocity noise, which contains IMU noise only
+    if noises.random_walk_m:
         dp[..., is_joined] += (
             noises.random_walk_m
             * np.sqrt(positions.length_s[is_joined])

@@ -54,8 +54,8 @@ MAX_OUTLIER_SHARE = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio between an estimate and an end of the search range for reporting a bound instead of
-# the estimate
+# Maximum ratio between an estimate and an end of the search range, for reporting the end as a bound
+# instead of the estimate
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -261,11 +261,12 @@ def tune_axes(
     intervals = [preintegrate(axis, settings) for axis in axes]
     count = len(intervals[0].measurement_m)
     if count < MIN_MEASUREMENTS:
-        return too_few_measurements(f"tuning, {name}", count, MIN_MEASUREMENTS)
+        return too_few_measurements(f"estimate of the noises ({name})", count, MIN_MEASUREMENTS)
     axis_positions = [filter_positions(interval_input) for interval_input in intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
-    motion_fit = None  # becomes the fit with biases, tilt and time offset
+    # fit with biases, tilt and time offset; None without IMU data
+    motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF starts at the first measurement, so the fit of KF has no weight for that measurement
@@ -297,10 +298,10 @@ def tune_axes(
     is_outlier = kf_fit.outlier_probability > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_SHARE:
         return Unavailable(
-            f"tuning, {name}",
+            f"estimate of the noises ({name})",
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
-            "estimate the noise",
-            "Remove the outliers at the source first.",
+            "estimate SIGMA_Z",
+            "Reduce the outliers of the positioning system.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
@@ -399,7 +400,7 @@ def log_likelihood_drop(
 ) -> Array:
     """Return KF's log-likelihood below its maximum on a grid; rows: SIGMA_A, columns: SIGMA_Z.
 
-    Of ``axes``, those are used for which the noises were estimated.
+    Only those ``axes`` are used for which the noises were estimated.
     """
     names = ("north", "east") if tuning.name == HORIZONTAL else (tuning.name,)
     tuned_axes = [axis for axis in axes if axis.name in names]
@@ -424,7 +425,7 @@ def _check_held_out(
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
-            f"held-out check, {name}",
+            f"held-out check of the noises ({name})",
             f"half of the segment contains only {half_count} measurements (at least "
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",

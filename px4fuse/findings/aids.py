@@ -1,4 +1,4 @@
-"""Aiding sources of EKF2 that are not fused, overconfident, shifted or biased.
+"""Findings about aiding sources of EKF2: not fused, overconfident, shifted or biased.
 
 External vision position and height are tested by other modules, which replay EKF2.
 """
@@ -12,15 +12,14 @@ from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import capitalise_first, format_number, format_ratio
-from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
+from px4fuse.ekf2.aids import WINDOW_S, AidResult
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which a barometer that is not fused is no fault: the ground changes the
-# pressure
+# Time (s) after take-off in which EKF2 may ignore the barometer: ground effect changes the pressure
 TAKE_OFF_S = 10.0
 # Minimum ratio of EKF2's largest height error in a gap of the barometer to its height RMSE outside
 # the gap, for severity warning
@@ -29,7 +28,7 @@ MIN_HEIGHT_ERROR_RATIO = 3.0
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
 # Maximum fraction of the time with the flag for a bad vertical acceleration, for severity note
 MAX_SHORT_BAD_ACCELERATION = 0.3
-# Action for a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
+# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -68,10 +67,10 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Random innovations can cause this for some seconds."
-    remedy = "Change nothing for a few seconds; else check the IMU for vibration and clipping."
+    cause = "Random innovations can set this state for some seconds."
+    remedy = "If it lasts longer than some seconds, check the IMU for vibration and clipping."
     if noises:
-        cause = "The cause is that EKF2 assumes too small a noise for these sensors."
+        cause = "EKF2 assumes too small a noise for these sensors."
         remedy = f"Increase {' and '.join(sorted(noises))} to the true noise."
     share, start_s = float(is_bad.mean()), float(times[is_bad.argmax()])
     is_long = share > MAX_SHORT_BAD_ACCELERATION
@@ -101,6 +100,7 @@ def detect_in_aids(
     source_aid : str
         Aiding source whose positions KF also uses; other modules test its variance.
     take_off_s : sequence of float
+    Times of take-off.
     height_error_m : float or None
         EKF2's largest height error (m) in the longest gap of the barometer; None if unknown or
         not larger than usual.
@@ -119,14 +119,13 @@ def detect_in_aids(
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
         is_barometer, effect = switch == BAROMETER.switch, ""
         if is_barometer and height_error_m is not None:
-            effect = f": height error {height_error_m:.2f} m"
+            effect = f", with a height error of {height_error_m:.2f} m"
         yield finding(
             "note" if is_barometer and not effect else "warning",
             "aid_not_fused",
-            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} s"
-            f"{effect}. Fusion was enabled; the limit is {NOT_FUSED_LIMIT_S:g} s, and "
-            f"{format_percent(longest_unfused.rejected_fraction)} of the samples were rejected. "
-            "EKF2 relied on its other aids and the IMU.",
+            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} "
+            f"s{effect}. EKF2 rejected {format_percent(longest_unfused.rejected_fraction)} of the "
+            "samples, and relied on the IMU and other aiding sources.",
             CHECKS.get(switch, OTHER_CHECK),
             {
                 "aid": labels,
@@ -146,24 +145,26 @@ def detect_in_aids(
                 "aid_innovation_shift",
                 f"{capitalise_first(label)}: the {axis} innovation shifts by "
                 f"{format_number(abs(shift) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. The mean "
-                f"before and after differs by {abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} "
-                f"{aid.unit}). EKF2 changes its states until the innovation is small again.",
+                f"innovation before and after differs by {abs(shift):.1f} √S (√S "
+                f"{format_number(s_sqrt, 2)} {aid.unit}). EKF2 changes its states until the "
+                "innovation is small again.",
                 f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
                 ((time_s, time_s + WINDOW_S),),
             )
         elif aid.verdict == "overconfident" and name != source_aid:
-            # no value is proposed: innovations alone cannot separate noise from a wrong delay
+            # no noise value is proposed: innovations alone do not distinguish noise from a wrong
+            # delay
             action = "Then correct the accuracy that the sensor reports."
             if noise_parameter := AIDS[name].noise:
                 action = f"Then increase {noise_parameter}."
             yield warning(
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
-                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), and "
-                f"{format_percent(aid.rejected_fraction)} of the samples are rejected. The "
-                f"errors of this aid are larger than R{_format_noise(aid)}, or another aid is "
-                "wrong.",
+                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), "
+                f"and {format_percent(aid.rejected_fraction)} of the samples are rejected. The "
+                f"errors of this aiding source are larger than R{_format_noise(aid)}, or another "
+                "aiding source is wrong.",
                 f"Check delay and mounting of the sensor first. {action}",
                 {
                     "aid": name,
@@ -180,9 +181,9 @@ def detect_in_aids(
                 "aid_innovation_bias",
                 f"{capitalise_first(label)}: the {axis} innovation has a mean of "
                 f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
-                f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aid and another one "
-                "contradict each other.",
-                "Calibrate the sensor. Changing noises does not correct a bias.",
+                f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
+                "contradicts another one.",
+                "Calibrate the sensor. Noise settings do not correct a bias.",
                 {
                     "aid": name,
                     "axis": axis,
@@ -201,7 +202,7 @@ def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
-    largest_m = float(error_m[is_in_span].max())  # NaN if no error is known
+    largest_m = float(error_m[is_in_span].max())  # NaN if all errors in the span are unknown
     return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
 
 

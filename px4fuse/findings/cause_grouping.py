@@ -8,7 +8,7 @@ from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import TITLES, group_by_root
 
-# Key in Finding.evidence of the kind of cause, which re-runs with a change have shown
+# Key in Finding.evidence whose value is the kind of cause that re-runs of a filter have shown
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,15 +20,16 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white noise of the source over the measurement σ of a filter. It is
-# present only if the ratio is large; then the assumed σ is a separate fault
+# Key in Finding.evidence: ratio of the source's white noise to the measurement noise that a filter
+# assumes. Only a large ratio is stored; the assumed noise is then a separate fault
 WHITE_RATIO = "white_over_assumed"
-# Values of CAUSE in a finding about an aiding source: this and the position source are the same
-# sensor, or the mean innovation of the aiding source changes in flight
+# Values of CAUSE in a finding about an aiding source: it belongs to the same sensor as the
+# positions of KF, or its mean innovation changes in flight
 SENSOR, CHANGE = "the source's sensor", "change"
-# Kind of cause of ekf2_resets: each position reset follows a gap in the position source
+# Value of CAUSE in the finding ekf2_resets if each position reset follows a gap in the source
 GAP = "gap"
-# Key in Finding.evidence of findings about the convention of the source, which precede all others
+# Key in Finding.evidence of findings about axes, unit, clock or orientation of the source, which
+# precede all other findings
 CONVENTION = "convention"
 # Findings that precede all others, because no estimate from these positions or this IMU is valid.
 WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
@@ -64,7 +65,7 @@ NOISES = frozenset(
         "process_noise_near_zero",
     )
 )
-# Findings that a cause explains, one per line: "id", or "id: kind of cause"
+# Effects of a finding, by its id; one effect per line: "id", or "id: value of CAUSE"
 CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
 RECORDING = frozenset(
     {
@@ -122,13 +123,13 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def effect_ids(cause: str) -> tuple[str, ...]:
-    """Return the ids of the findings that a finding can cause, each once."""
+    """Return the ids of the findings that one finding can cause, without duplicates."""
     effects = CONSEQUENCES.get(cause, "").splitlines()
     return tuple(dict.fromkeys(effect.partition(":")[0] for effect in effects))
 
 
 def _report_rank(group: list[Finding]) -> int:
-    # gaps of the recording falsify estimated noises: RECORDING warnings precede NOISES errors
+    # gaps in the recording falsify noise estimates: warnings in RECORDING precede errors in NOISES
     cause = group[0]
     is_first = CONVENTION in cause.evidence or cause.id in (
         *UNUSABLE,

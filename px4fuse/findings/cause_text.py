@@ -1,4 +1,4 @@
-"""Texts about re-runs with a changed setting or corrected data: kind of cause, change, action."""
+"""Texts about a re-run with a changed setting or corrected data: kind of cause, change, action."""
 
 from collections.abc import Mapping
 
@@ -25,7 +25,7 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 
 def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
-    """Return the kind of cause by the changed quantity of a re-run."""
+    """Return the kind of cause that a re-run shows; ELSEWHERE without a re-run."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
@@ -80,8 +80,10 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS, None):
-        place = "Give the antenna a free view of the sky" if is_gnss else "Restore line of sight"
-        actions.append(f"{place}, or remove the outliers at the sender.")
+        actions.append(
+            f"{'Give the antenna a free view of the sky' if is_gnss else 'Restore line of sight'}, "
+            "or remove the outliers before sending."
+        )
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)
@@ -93,14 +95,17 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
-        verb = f"Subtract {-offset_s:.3f} s from" if offset_s < 0 else f"Add {offset_s:.3f} s to"
-        actions.append(f"{verb} the timestamps at the sender.")
+        actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
     if change:
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))
     return " ".join(actions)
+
+
+def format_shift(shift_s: float) -> str:
+    return f"Subtract {-shift_s:.3f} s from" if shift_s < 0 else f"Add {shift_s:.3f} s to"
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:
@@ -124,7 +129,9 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
         case trials.FORWARD_BIAS:
             right = cause.change[trials.RIGHT_BIAS]
-            return f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} right)"
+            return (
+                f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} m/s² right)"
+            )
         case trials.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             mean = " on average" if is_drifting else ""
@@ -136,7 +143,8 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
         case changes.SIGMA_A | changes.SIGMA_Z:
             label, unit = name[:7].upper(), SETTING_UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
-    assert not isinstance(analysis.ekf2_model, Unavailable)  # EKF2 was replayed with the change
+    # re-runs of EKF2 need its model
+    assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
     return f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}".replace(
         "  ", " "

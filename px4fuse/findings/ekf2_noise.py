@@ -16,10 +16,10 @@ from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum ratio of flown and estimated noise (σ) for severity error: a smaller one hardly changes
-# EKF2's error
+# Minimum ratio of flown to estimated noise (σ), or inverse, for severity error: a smaller ratio
+# hardly changes EKF2's position error
 MIN_RATIO_ERROR = 2.0
-# Minimum fraction of rejected positions for the title to state it
+# Minimum fraction of rejected positions for the finding's title to state it
 MIN_NAMED_REJECTION = 0.05
 
 
@@ -40,14 +40,14 @@ def detect(analysis: Analysis) -> Findings:
     rejected = analysis.main.rejected_fraction or 0.0
     if rejected >= MIN_NAMED_REJECTION:
         effect = f": EKF2 rejects {format_percent(rejected)} of the positions"
-        reason = f"EKF2 takes ordinary {sensor} noise for outliers, rejects it and uses the IMU."
+        reason = f"EKF2 rejects ordinary {sensor} noise as outliers and relies on the IMU."
     else:
         effect, gain = "", "large" if is_small else "small"
         reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
     title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
-    if is_small and is_default:  # the user did not choose it
-        assumed = "both filters assume" if is_shared else "EKF2 assumes"
+    if is_small and is_default:  # with PX4's default, name the sensor, not the parameter
+        assumed = "KF and EKF2 assume" if is_shared else "EKF2 assumes"
         title = f"{sensor} noise is {format_factor(size)} times what {assumed}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(tuned, AxisTuning) and tuned.sigma_z.low and tuned.sigma_z.high:
@@ -56,8 +56,9 @@ def detect(analysis: Analysis) -> Findings:
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",
-        f"{title}. {aid.noise} {flown_m:g} m; maximum-likelihood estimate {estimate_m:.3g} m"
-        f"{interval}. {reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_shared else ''}",
+        f"{title}. {aid.noise} is {flown_m:g} m; the maximum-likelihood estimate is "
+        f"{estimate_m:.3g} m{interval}. "
+        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_shared else ''}",
         f"Set {format_settings(trial.change)}.",
         {"flown_m": flown_m, "estimate_m": estimate_m, "factor": ratio},
     )

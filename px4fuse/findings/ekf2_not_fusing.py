@@ -1,4 +1,4 @@
-"""EKF2 does not use the source for horizontal position, or only for part of the flight."""
+"""Position source that EKF2 does not fuse horizontally, or only for part of the flight."""
 
 import numpy as np
 import pandas as pd
@@ -25,17 +25,18 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
 from px4fuse.flight.position_source import POSITION_FILE
 
-# Minimum fraction of the segment with fusion for a severity below error: with less, EKF2 uses other
-# sensors most of the time
+# Minimum fraction of the analysed time with fusion of the source for a severity below error: with
+# less fusion, EKF2 uses other sensors most of the time
 MIN_FUSING_SHARE_ERROR = 0.5
-# Minimum fraction of the segment with fusion for no finding: 2 % of a minute are about 1 s
+# Minimum fraction of the analysed time with fusion of the source without a finding: 2 % of a minute
+# are about 1 s
 MIN_FUSING_SHARE_WARNING = 0.98
-# Minimum interval (s) of positions that may delay the start of fusion: with 10 % of jitter it
-# reaches EV_START_INTERVAL_S
+# Minimum interval (s) between positions that may delay the start of fusion: with 10 % jitter, an
+# interval reaches EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) to the reference for a finding of an invalid position: it is smaller before
-# take-off
+# Minimum distance (m) of EKF2 from ground truth or source for a finding of an invalid position:
+# before take-off the distance is smaller
 MIN_INVALID_DISTANCE_M = 1.0
 
 
@@ -68,10 +69,11 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
         if source.name == MOTION_CAPTURE_TOPIC and not share:
             yield warning(
                 "ekf2_not_fusing",
-                f"EKF2 never fused the {positions}: it does not read {source.name}. PX4 writes "
-                "ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic, as ground "
-                "truth. EKF2's track does not come from this source.",
-                "To fuse it, send VISION_POSITION_ESTIMATE, or ODOMETRY of estimator type VISION.",
+                f"EKF2 never fused the {positions}: EKF2 does not read {source.name}. PX4 writes "
+                "ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as ground "
+                "truth.",
+                "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
+                "estimator type VISION.",
                 evidence,
             )
         return
@@ -117,7 +119,6 @@ def _received_source(analysis: Comparison) -> PositionTrack | None:
 
 
 def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
-    """Detect that EKF2 declares its own horizontal position invalid."""
     is_valid = ekf2.states.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
@@ -129,7 +130,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if distance_m < MIN_INVALID_DISTANCE_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
-    distance = f" Its distance to the {reference} is up to {format_metres(distance_m)} m."
+    distance = f" EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
     if not np.isfinite(distance_m):
         distance = ""
     yield finding(
@@ -137,7 +138,8 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(share)} of the time. EKF2 sets "
         f"xy_valid to 0, and PX4 does not use the position.{distance}",
-        "Correct the fusion first. Errors of EKF2 in this time do not depend on its noises.",
+        "Restore the fusion of positions first. EKF2's errors in this time do not depend on "
+        "noise settings.",
         {"invalid_fraction": share, "distance_m": distance_m},
         spans,
     )
@@ -146,7 +148,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
     """Return EKF2's largest horizontal distance (m) to ground truth, else to the source.
 
-    NaN if neither has samples in the spans.
+    Return NaN without samples in the spans.
     """
     truth, axes = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
@@ -159,7 +161,7 @@ def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
-    """Detect that EKF2 resumed fusion late after a gap, because positions are too rare."""
+    """Detect that EKF2 resumed fusion late after a gap, as the position rate is too low."""
     source = analysis.source
     is_limited = "EKF2_EV_CTRL" in analysis.flight.log.parameters  # v1.14 and later
     is_known = source.origin.is_vision and source.origin.has_all_samples and not source.alignment
@@ -181,7 +183,7 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
             "source_rate_at_limit",
             f"{capitalise_first(positions_of(source))} come at {source.rate_hz:.1f} Hz, so EKF2 "
             f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
-            f"fusion only when two positions come within {EV_START_INTERVAL_S:g} s.",
+            f"fusion only if two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
             {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(late_spans)},
             tuple(late_spans),

@@ -13,11 +13,12 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
-# rejects 6e-7
+# rejects a fraction of 6e-7
 REJECTED_SHARE_WARNING = 0.01
-# Minimum fraction of rejected samples for an error: R or the time offset is wrong
+# Minimum fraction of rejected samples for severity error: R or the time offset must be wrong
 REJECTED_SHARE_ERROR = 0.20
-# Maximum ratio of rejected fractions after and before a change that prevents rejections
+# Maximum ratio of the rejected fraction with a change to that as flown, for a change that prevents
+# rejections
 MAX_REJECTED_RATIO = 0.5
 
 
@@ -32,7 +33,8 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
     """Detect a gate that would reject 1 % of the samples of a consistent filter."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
-        # EKF2 accepts a sample if the normal innovations of both axes are inside: erf(gate/√2)²
+        # EKF2 accepts a sample if both normally distributed innovations are inside the gate:
+        # erf(gate/√2)²
         expected = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected >= REJECTED_SHARE_WARNING:
             aid = aid_of(analysis)
@@ -41,8 +43,9 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
                 rejections[0].severity,
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects {format_percent(rejected)} "
-                f"of the positions. This gate rejects {format_percent(expected)} of the samples of "
-                "a source with the assumed noise. Rejected samples do not correct EKF2.",
+                "of the positions. Without any fault, this gate rejects "
+                f"{format_percent(expected)} of the positions. Rejected positions do not correct "
+                "EKF2.",
                 f"Set {aid.gate} to {aid.default_gate:g} (PX4's default).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected},
             )
@@ -76,8 +79,10 @@ def _remedy(analysis: Analysis, result: AxisComparison) -> str:
     trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
     if trials and result is analysis.main:
         return format_action(analysis, min(trials, key=preference).change)
-    place = "the reception" if aid == GNSS_POS else "the line of sight"
-    return f"Check {place}, {aid.delay} and {aid.noise} first. Increase {aid.gate} last."
+    return (
+        f"Check {'reception' if aid == GNSS_POS else 'line of sight'}, {aid.delay} and {aid.noise} "
+        f"first. Increase {aid.gate} last."
+    )
 
 
 def _prevents_rejections(trial: Trial) -> bool:

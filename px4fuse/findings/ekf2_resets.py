@@ -10,9 +10,9 @@ from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
 from px4fuse.flight.model import Ekf2, Reset
 
-# Time (s) after take-off in which EKF2 usually resets its height
+# Time (s) after take-off in which a height reset of EKF2 is usual
 TAKE_OFF_S = 10.0
-# Time (s) after a gap in the source in which EKF2 resets its position to the source
+# Maximum time (s) from the end of a gap in the source to the position reset that the gap causes
 AFTER_GAP_S = 5.0
 
 

@@ -32,32 +32,33 @@ from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
-# Minimum mean NEES for severity error: position errors of 4 σ
+# Minimum mean NEES for severity error: position errors of 4 reported σ
 MIN_NEES_ERROR = 16.0
 # Maximum ratio of the position RMSEs of KF and EKF2 for a fault of EKF2 alone: the common source
 # then causes at most half of EKF2's mean square error
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum ratio of the position RMSE after and before alignment for a misaligned frame
+# Maximum ratio of the position RMSE after alignment to that before, for a misaligned frame
 MAX_ALIGNED_SHARE = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
     "loop LOG) corrects the path of this flight, not the filters."
 )
-FRAME_REMEDY = "Rotate and shift the frame of the source into that of the ground truth."
+FRAME_REMEDY = "Rotate and shift the positions into the frame of the ground truth."
 EKF2_REMEDY = (
-    "Check EKF2's delay, heading and other aids: KF has a smaller error with the same source."
+    "Check delay, heading and other aiding sources of EKF2: KF has a smaller error with the "
+    "same positions."
 )
 HEIGHT_REMEDY = (
     "Check the height sensors that EKF2 fuses (EKF2_HGT_REF) and the accelerometer: KF has a "
     "smaller height error."
 )
 SHARED_REMEDY = (
-    "Check the time offset (px4fuse sync LOG). Then check multipath, the anchor survey and filters "
-    "in the sender."
+    "Check the time offset (px4fuse sync LOG). Then check multipath, the anchor survey and "
+    "smoothing in the positioning system."
 )
 GNSS_REMEDY = (
-    "Check the age of a fix (px4fuse sync LOG). Then check reception, EKF2's heading and the lever "
-    "arm of the antenna."
+    "Check the delay of the GNSS positions (px4fuse sync LOG). Then check reception, EKF2's "
+    "heading and the lever arm of the antenna."
 )
 
 
@@ -69,8 +70,8 @@ class AlignedError(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"{format_metres(self.before_m)} m, after the best shift and rotation "
-            f"{format_metres(self.after_m)} m"
+            f"{format_metres(self.before_m)} m, and {format_metres(self.after_m)} m after the "
+            "best shift and rotation"
         )
 
     @property
@@ -82,10 +83,10 @@ class AlignedError(NamedTuple):
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
     """Find position errors larger than the reported σ that innovations do not show.
 
-    Returns filter, axis and size of each error, the largest mean NEES first.
+    Return (filter, axis, error) for each of them, the largest mean NEES first.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
-    # a frame that was fitted to EKF2's track may contain EKF2's error
+    # a position frame that was fitted to EKF2's track may contain EKF2's error
     if alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_error_m = alignment.residual_rms_m or 0.0
     errors = [
@@ -146,7 +147,7 @@ def make_error_finding(
     if may_drift and not causes and not is_misaligned:
         return _drift_finding(analysis, aligned, worst, evidence)
     if is_misaligned and aligned is not None:
-        sentences.append(f"The frame is misaligned: horizontal position RMSE {aligned}.")
+        sentences.append(f"The position frame is misaligned: horizontal position RMSE {aligned}.")
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_truth, ErrorsAgainstTruth)
@@ -190,13 +191,16 @@ def _drift_finding(
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
         share = format_percent(gap_m / length_m, 1)
         sentence = "" if aligned is None else f"Horizontal position RMSE {aligned}. "
-        size = f"loop closure error {format_metres(gap_m)} m after {length_m:.0f} m ({share})"
+        size = (
+            f"loop closure error {format_metres(gap_m)} m after a path of {length_m:.0f} m "
+            f"({share})"
+        )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {size}. {sentence}Both filters follow {sensor}: innovations are small, "
-        f"errors are not. Do not lower {noises}.",
+        f"{sensor} drifts: {size}. {sentence}KF and EKF2 follow {sensor}, so innovations are "
+        f"small and position errors are large. Do not reduce {noises}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -209,7 +213,7 @@ def _known_closure_error_m(loop: Loop) -> float | None:
 
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
-    """Return the horizontal RMSE before and after a fit in position and yaw."""
+    """Return the horizontal RMSE before and after a fit of position and yaw to ground truth."""
     error, true_track = [], []
     for result in north_and_east(comparison):
         errors, truth = position_errors(result, filter_name), result.truth
@@ -239,20 +243,23 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     tuned = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: it sends a heading, as odometry does. Innovations show how well a "
-        f"filter follows {sensor}, not the position error."
+        f"{sensor} may drift: its messages contain a heading, as with odometry. Innovations show "
+        f"how well a filter follows {sensor}, not the position error."
     )
     if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
         bound = "at most " if tuned.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise}
-        message += f" The noise from sample to sample is {bound}{noise:.2g} m, without the drift."
+        message += (
+            f" The noise between successive positions is {bound}{noise:.2g} m, without the drift."
+        )
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
         message += (
-            f" The loop closure error is {format_metres(gap_m)} m after {loop.path_length_m:.0f} m."
+            f" The loop closure error is {format_metres(gap_m)} m after a path of "
+            f"{loop.path_length_m:.0f} m."
         )
     action = (
-        "Measure the drift with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
-        "the source is motion capture, give --source-kind mocap."
+        "Measure the drift with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). "
+        "If the source is motion capture, run again with --source-kind mocap."
     )
     return note("source_may_drift", message, action, evidence)

@@ -13,7 +13,7 @@ from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
-# Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
+# Minimum accelerometer bias (m/s²) for severity error: its position error is 0.15 m after 1 s
 BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) with the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
@@ -21,15 +21,15 @@ TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 MIN_IMU_GAP_S = 0.2
 # Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
 MIN_IMU_RATE_HZ = 50.0
-# Minimum attitude rate (Hz) for interpolation
+# Minimum attitude rate (Hz) for interpolation of the attitude to the times of IMU samples
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
 MAX_CLIPPED_S = 0.1
-# Minimum time (s) without clipping between two reported time spans
+# Minimum time (s) without clipping between two reported time spans of clipping
 MIN_CLIPPING_PAUSE_S = 2.0
 # Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
 HIGH_RATE_BIT = 16
-# Minimum ratio of measured and requested rate: measured rates are up to 2 % lower
+# Minimum ratio of the measured to the needed rate: measured rates are up to 2 % below nominal
 RATE_MARGIN = 0.98
 
 
@@ -50,9 +50,9 @@ def detect_bias(analysis: Analysis) -> Findings:
         forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
         message = (
             f"The accelerometer is biased by {forward.value:+.2f} m/s² forward and "
-            f"{right.value:+.2f} m/s² right. Estimated from the positions "
-            f"(± {1.96 * forward.sigma:.2f} m/s², 95 %); a tilt error of "
-            f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF has no state for it"
+            f"{right.value:+.2f} m/s² right. The estimate is from the positions (± "
+            f"{1.96 * forward.sigma:.2f} m/s², 95 %). A tilt error of "
+            f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF does not estimate biases"
         )
         if ekf2_bias is not None:
             message += (
@@ -67,16 +67,16 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # a fit to the positions, if any, shows no horizontal bias: then use EKF2's bias along down
+        # if positions were fitted, they show no horizontal bias: use EKF2's bias along down only
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )
         if size >= MIN_BIAS_M_S2:
             yield warning(
                 "accelerometer_bias",
-                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s². It is "
-                f"{ekf2_bias[0]:+.2f} m/s² forward, {ekf2_bias[1]:+.2f} right and "
-                f"{ekf2_bias[2]:+.2f} down. KF has no state for it.",
+                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s². Its components are "
+                f"{ekf2_bias[0]:+.2f} forward, {ekf2_bias[1]:+.2f} right and {ekf2_bias[2]:+.2f} "
+                "down. KF does not estimate biases.",
                 "Calibrate the accelerometers at the temperature of the flight.",
                 {"bias_m_s2": size},
             )
@@ -97,9 +97,9 @@ def detect_tumbling(analysis: Analysis) -> Findings:
         end_s = max(spans[0][0] - 1.0, 0.0)
         yield error(
             "attitude_failure",
-            f"Roll or pitch exceeded PX4's failure-detector limits at {spans[0][0]:.1f} s. "
-            "Data after that time do not represent normal flight (FD_FAIL_R, FD_FAIL_P).",
-            f"Analyse only the time before (--end {end_s:.1f}).",
+            f"Roll or pitch exceeded PX4's failure-detector limits at {spans[0][0]:.1f} s. Later "
+            "data do not represent normal flight. The limits are FD_FAIL_R and FD_FAIL_P.",
+            f"Analyse only the time before this failure (--end {end_s:.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
@@ -117,9 +117,9 @@ def detect_clipping(analysis: Analysis) -> Findings:
         bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
         yield warning(
             "accelerometer_clipping",
-            f"The accelerometer was clipped for {total_s:.2f} s ({len(time_s)} samples). Motion "
-            "beyond its range is lost. Height and vertical velocity are affected first, and the "
-            "error looks like a bias.",
+            f"The accelerometer was clipped for {total_s:.2f} s ({len(time_s)} samples). The log "
+            "lacks motion beyond the sensor range. Height and vertical velocity are affected "
+            "first; the error resembles a bias.",
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
             "without clipping (--start, --end).",
             {"count": len(time_s), "total_s": total_s},
@@ -135,7 +135,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
         # KF needs IMU and attitude; without a gap in the IMU the attitude is missing
-        missing = "IMU" if spans else "attitude"
+        missing = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
             action = "Record on a link without message loss. "
@@ -143,8 +143,8 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Use a faster SD card. "
         yield warning(
             "imu_gap",
-            f"No {missing} samples for {gap_s:.2f} s. In the gap KF increases Q to the variance of "
-            "the measured acceleration.",
+            f"{missing} samples are missing for {gap_s:.2f} s. In this gap KF increases Q to the "
+            "variance of the measured acceleration.",
             f"{action}Analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             spans,
@@ -166,16 +166,16 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
         action = f"Use a faster SD card, or set SDLOG_PROFILE to {profile ^ other_topics}."
     yield warning(
         "imu_samples_missing",
-        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. The logger "
-        "lost single samples all over the flight. KF raises its process noise in gaps. EKF2 cannot "
-        "be replayed, so no change of a parameter can be predicted.",
+        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
+        "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
+        "is unknown.",
         action,
         {"lost_fraction": lost_fraction, "sdlog_profile": profile},
     )
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Return the spans (s) without IMU samples in a segment, including its start and end."""
+    """Return the time spans (s) without IMU samples in a segment, also at its start and end."""
     time_s = imu.index.to_numpy()
     is_gap = imu_gaps(time_s)
     gaps = list(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
@@ -203,9 +203,10 @@ def detect_low_rates(flight: Flight) -> Findings:
             profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
             action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
-                ulog = ", or give the ULog of the flight" if log.has_ulog else ""
                 action = (
-                    f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL){ulog}."
+                    f"Request {topic} at {requested_hz:g} Hz "
+                    "(MAV_CMD_SET_MESSAGE_INTERVAL)"
+                    f"{', or give the ULog of the flight' if log.has_ulog else ''}."
                 )
             yield warning(
                 "imu_rate_too_low",

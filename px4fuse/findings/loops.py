@@ -7,10 +7,12 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-# Maximum fraction of dropped closures: if more are dropped, the stated drift is too small
+# Maximum fraction of loop closures that robust optimisation rejects: above it, the stated odometry
+# drift is too small
 MAX_DROPPED_SHARE = 0.5
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-# Minimum weight of a closure that GNC uses; its final weights are near 0 or 1 (Yang et al. 2020)
+# Minimum GNC weight of a loop closure that is not rejected: final weights are near 0 or 1 (Yang et
+# al. 2020)
 MIN_KEPT_WEIGHT = 0.5
 
 
@@ -34,9 +36,9 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
     if drops_most:
         yield warning(
             "loop_drift_too_small",
-            f"Robust optimisation drops {dropped_count} of {len(weights)} loop closures. An "
-            "odometry drift larger than stated is more likely than that most closures are false.",
-            "Increase --drift or --heading-drift.",
+            f"Robust optimisation rejects {dropped_count} of {len(weights)} loop closures. "
+            "Odometry drift above the stated drift is more likely than so many false closures.",
+            "Increase the stated drift (--drift or --heading-drift).",
             {"dropped": dropped_count, "closures": len(weights)},
         )
     for closure, weight in zip(loop.closures, weights, strict=True):
@@ -45,33 +47,32 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         elif weight < MIN_KEPT_WEIGHT and not drops_most:
             yield warning(
                 "loop_closure_inconsistent",
-                f"{capitalise_first(str(closure))} contradicts the other closures. Robust "
-                "optimisation drops this closure, although drift could explain the closure error.",
-                "Remove the closure, or use the robust solution (GNC).",
+                f"{capitalise_first(str(closure))} contradicts the other loop closures. Robust "
+                "optimisation rejects it, although drift could explain its closure error.",
+                "Remove this loop closure, or use the path of the robust optimisation (GNC).",
                 _evidence(closure) | {"gnc_weight": weight},
             )
 
 
 def detect_assumptions(loop: Loop) -> Findings:
-    """Detect a loop without drift, and a landing place that is assumed."""
+    """Detect a loop on positions that do not drift, and an assumed landing place."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.is_absolute_track:
         yield warning(
             "loop_on_absolute_positions",
-            "This track follows an absolute positioning system and does not drift. Its closure "
-            "error is the noise of one position. A correction with this closure error makes the "
-            "path worse.",
+            "This track follows an absolute positioning system and does not drift. The loop "
+            "closure error is the noise of one position, so a correction makes the path worse.",
             "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
         yield note(
             "loop_landing_assumed",
-            "The landing place is unknown, so px4fuse assumes the take-off place. The distance "
-            "between landing and take-off counts as closure error.",
-            "Measure the landing place and give --landed-at FORWARD,RIGHT (m, along and to the "
-            "right of the nose at take-off).",
+            "The landing place is unknown, so px4fuse assumes the take-off place. The true "
+            "distance between both places appears as loop closure error.",
+            "Measure the landing place and state it: --landed-at FORWARD,RIGHT (m, along and to "
+            "the right of the nose at take-off).",
             evidence,
         )
 
@@ -84,18 +85,19 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
             f"False loop closure of {closure.distance_m:.2f} m: the landing place is not the "
             "take-off place"
         )
-    action = "Remove this closure; px4fuse does not use it."
+    action = "Remove this loop closure; px4fuse ignores it."
     if is_landing:
         action = (
-            "If the vehicle landed elsewhere, give the place (--landed-at FORWARD,RIGHT) or leave "
-            "the landing out (--open)."
+            "If the vehicle landed elsewhere, state the place (--landed-at FORWARD,RIGHT) or "
+            "ignore the landing (--open)."
         )
     return error(
         "false_loop_closure",
-        f"{fault}. The stated drift does not explain the closure error (d² {closure.d2:.0f}, "
-        f"{closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}). Enforcing the "
-        "closure would deform the whole path.",
-        f"{action} If the odometry really drifts this much, increase --drift and --heading-drift.",
+        f"{fault}. The stated drift does not explain the closure error (squared Mahalanobis "
+        f"distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p "
+        f"{closure.p:.1g}). Enforcing the closure would deform the whole path.",
+        f"{action} If the odometry does drift this much, increase the stated drift (--drift, "
+        "--heading-drift).",
         _evidence(closure),
     )
 

@@ -28,7 +28,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     if isinstance(acceleration, Unavailable):
         yield warning(
             "acceleration_not_logged",
-            "The acceleration is missing, so KF assumes constant velocity. No "
+            "The acceleration is missing, so KF assumes constant velocity. Missing "
             f"{acceleration.what}: {acceleration.reason}.",
             acceleration.remedy,
         )

@@ -1,4 +1,4 @@
-"""SIGMA_Z or SIGMA_A of KF that is wrong, and KF or EKF2 that is over- or underconfident.
+"""Findings about wrong SIGMA_Z or SIGMA_A of KF, and about over- or underconfident KF or EKF2.
 
 The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can: a
 wrong SIGMA_A correlates successive innovations, a wrong SIGMA_Z hardly does. Both are estimated,
@@ -46,42 +46,44 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum ratio of a setting and its estimate (σ) for a warning: with less the track hardly changes
+# Minimum ratio of a noise setting to its estimate, or inverse, for a warning: below, the track
+# hardly changes
 MIN_NOISE_RATIO = 1.5
-# Minimum ratio of a setting and its estimate (σ) for severity error
+# Minimum ratio of a noise setting to its estimate, or inverse, for severity error
 MIN_NOISE_RATIO_ERROR = 4.0
-# Minimum response time (s) of KF for Q almost zero: vehicles turn faster
+# Minimum response time (s) of a KF with Q almost zero: vehicles turn faster
 MIN_RESPONSE_TIME_S = 2.5
-# Factor on the 95 % interval (log scale) of a setting: 0.3 % of correct settings are outside
+# Factor on the 95 % interval of a noise estimate (log scale): 0.3 % of correct settings are outside
 INTERVAL_WIDENING = 1.5
-# Minimum lag-1 autocorrelation of the innovations for a lagging KF: white ones have less than 0.2
+# Minimum lag-1 autocorrelation of the innovations of a lagging KF: white innovations have below 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
-# Minimum ratio of actual and reported σ, or its inverse, for severity error
+# Minimum ratio of actual to reported σ, or inverse, for severity error
 MIN_SIGMA_RATIO_ERROR = 2.0
-# Maximum ratio of two estimates of the same noise: two standard errors of a median of 100 values
+# Maximum ratio of two values of a noise that count as equal: two standard errors of a median of 100
+# values
 NOISE_RATIO_TOLERANCE = 1.25
-# Minimum ratio of √R and EKF2_EVP_NOISE for an R that the sender reports
+# Minimum ratio of √R to EKF2_EVP_NOISE for an R that EKF2 takes from the position messages
 MIN_REPORTED_RATIO = 1.25
-# Actions for an inconsistent filter whose cause no re-run shows
+# Actions for an over- or underconfident filter whose cause no re-run shows
 NOT_EXPLAINED = (
-    "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
-    "(rate, gaps, vibration)."
+    "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
+    "IMU (rate, gaps, vibration)."
 )
-UNKNOWN_NOISE = "The noise could not be estimated: run px4fuse tune LOG for the reason."
+UNKNOWN_NOISE = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT = "No change: a re-run with the estimate improves neither position nor σ."
 
 
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
-KEEP_NOISES_DRIFT = "Do not reduce the noises: innovations do not show the drift of the source."
+KEEP_NOISES_DRIFT = "Do not reduce noise settings: innovations do not show the drift of the source."
 KEEP_NOISES_CORRELATED = (
-    "Do not reduce the noises: R has to cover the time-correlated error of {}, which innovations "
-    "do not show."
+    "Do not reduce noise settings: R has to include the time-correlated error of {sensor}, which "
+    "innovations do not show."
 )
 KEEP_NOISES_TRUTH = (
-    "Do not reduce the noises: σ would become smaller than the errors against ground truth."
+    "Do not reduce noise settings: σ would become smaller than the errors against ground truth."
 )
-# Effect and mechanism of a noise setting that is too small or too large
+# Effect on KF of a noise setting that is too small or too large, and reason
 SETTING_EFFECTS = {
     (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
     (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
@@ -192,11 +194,11 @@ def _setting_finding(
 def format_estimate(name: str, chosen: float, noise: Noise) -> str:
     """Format a setting with its maximum-likelihood estimate and 95 % interval."""
     label, unit = name[:7].upper(), SETTING_UNITS[name]
-    estimate = f"{label} {chosen:g} {unit}; maximum-likelihood estimate"
-    if noise.value is None:
-        return f"{estimate} at most {noise.high:.3g} {unit}"
-    interval = f" (95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit})" if noise.high else ""
-    return f"{estimate} {noise.value:.3g} {unit}{interval}"
+    value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
+    value += f" {unit}"
+    if noise.value is not None and noise.high:
+        value += f" (95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit})"
+    return f"{label} is {chosen:g} {unit}; its maximum-likelihood estimate is {value}"
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
@@ -212,11 +214,11 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     ):
         return NO_IMPROVEMENT
     value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
-    return f"Compare with a run with {COMPARISON_OPTIONS[name]} {value:.3g}."
+    return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
 def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
-    """Compare a noise setting with its estimate; None without a significant difference."""
+    """Return the deviation of a noise setting from its estimate; None if not significant."""
     if not (value := ml_noise.value or ml_noise.high):
         return None
     low, high = (
@@ -235,8 +237,8 @@ def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDevia
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions.
 
-    Without motion a slow filter is correct, so the innovations must also be correlated and too
-    large.
+    Without motion such a filter is correct, so a finding needs innovations that are correlated and
+    too large.
     """
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
@@ -258,8 +260,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"{title}: KF ignores new positions. {estimate}The process noise is almost "
-            f"zero, so the gain falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a "
+            f"{title}: KF ignores new positions. {estimate}The process noise is almost zero, so "
+            f"the gain falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a position "
             "change.",
             action,
             {
@@ -312,7 +314,7 @@ def _variance_finding(
             _format_excessive_noise(analysis) if filter_name == "ekf2" and not is_barometer else ""
         )
         cause = NOISE if remedy_text else ELSEWHERE
-        fallback = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
+        fallback = KEEP_NOISES_CORRELATED.format(sensor="a barometer" if is_barometer else "GNSS")
         severity, remedy_text = severity if remedy_text else "note", remedy_text or fallback
     elif is_underconfident and filter_name == "ekf2" and (floor := _noise_minimum(analysis)):
         severity, remedy_text, cause = "note", floor, ELSEWHERE
@@ -355,24 +357,24 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     reported_m = float(np.sqrt(reported_variance.median()))
     tuned = first_axis_tuning(analysis.tuning, HORIZONTAL)
     noise_m = max(reported_m, (tuned.sigma_z.value if tuned else None) or 0.0)
-    if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # false for NaN too
+    if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
         return ""
     source = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
     return (
-        f"{name} is {parameter_m:g} m, but {source} {noise_m:.2g} m: test this value with px4fuse "
-        "whatif."
+        f"{name} is {parameter_m:g} m, but {source} {noise_m:.2g} m: test the second value with "
+        "px4fuse whatif."
     )
 
 
 def _noise_minimum(analysis: Analysis) -> str:
-    """Describe EKF2's minimum noise of vision positions if GNSS sets it, else return ""."""
+    """Describe EKF2's minimum noise of vision positions; empty unless GNSS determines it."""
     parameters = analysis.flight.log.parameters
     gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
     is_besides_gnss = analysis.source.origin.is_vision and fused_aid(analysis.flight.ekf2)
     if not is_besides_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
         return ""
     return (
-        "No change: while EKF2 fuses GNSS, it assumes for vision positions at least "
+        "No change: while EKF2 fuses GNSS, EKF2's noise of vision positions is at least "
         f"{GNSS_POS.noise} ({gnss_m:g} m)."
     )
 
@@ -416,7 +418,7 @@ def _remedy(
 def _remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Format the action from EKF2's R and the estimated noise."""
+    """Format the action for EKF2's R if EKF2 was not re-run."""
     aid, noise = aid_of(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
@@ -429,12 +431,12 @@ def _remedy_without_replay(
         is_reported = ekf2_m > MIN_REPORTED_RATIO * parameters.get(aid.noise, np.inf)
         changes = noise_change(aid, parameters, ekf2_m * is_reported, noise_m)
         return (
-            f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay of this log "
-            "confirms it: fly again and compare."
+            f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay confirms this "
+            "change: fly again and compare."
         )
     return (
-        f"The noise of EKF2 ({ekf2_m:.2g} m) is right: check {aid.delay} and EKF2_ACC_NOISE "
-        "instead."
+        f"EKF2's measurement noise ({ekf2_m:.2g} m) is right: check {aid.delay} and "
+        "EKF2_ACC_NOISE instead."
     )
 
 

@@ -33,8 +33,7 @@ def detect_dropouts(analysis: Comparison) -> Findings:
         yield warning(
             "logger_dropouts",
             f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
-            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s. All "
-            "topics are missing in these intervals.",
+            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -48,12 +47,16 @@ def detect_lost_data(flight: Flight) -> Findings:
         fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
         if log.damage:
             lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
-            size = f": {format_number(100.0 * lost_fraction, 2)} % of its bytes cannot be read"
-            damage = "the log is damaged" + (size if lost_fraction else "")
+            damage = "the log is damaged"
+            if lost_fraction:
+                lost_percent = format_number(100.0 * lost_fraction, 2)
+                damage = f"the log is damaged: {lost_percent} % of its bytes cannot be read"
             fault = " ".join(f"{_sentence(note)}." for note in (damage, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."
         if not log.damage:
-            action = "Log until after the landing. If the file was cut off, copy it again."
+            action = (
+                "Stop logging only after landing. If the file is incomplete, copy the file again."
+            )
         elif log.format.startswith("MAVLink"):
             action = "Record on a link that loses no bytes: by cable, or on the companion computer."
         yield finding(
@@ -68,10 +71,10 @@ def detect_lost_data(flight: Flight) -> Findings:
         other_topics = f" (other topics with such samples: {other_count})" if other_count else ""
         yield note(
             "samples_out_of_order",
-            f"{count} samples of {topic} have wrong timestamps. They are zero or go "
-            f"back{other_topics}, so px4fuse dropped the samples. Possible cause: a clock was set "
-            "back, or messages overtook each other.",
-            "Synchronise the clock of the sender before take-off (TIMESYNC).",
+            f"{count} samples of {topic} have wrong timestamps. The timestamps are zero or go "
+            f"back{other_topics}, so px4fuse ignores these samples. Possible cause: a clock was "
+            "set back, or messages arrived in another order.",
+            "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": other_count + 1},
         )
 
@@ -83,7 +86,7 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
         yield warning(
             "autopilot_restarted",
             f"The autopilot's boot clock restarted {format_count(log.restarts)}. px4fuse reads "
-            "only the longest part.",
+            "only the longest recording between restarts.",
             "Record each flight in a separate file.",
             {"count": log.restarts},
         )
@@ -91,8 +94,8 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
         yield note(
             "receive_time_went_back",
             f"The receive time went back {format_count(reversals)}. Possible cause: the recording "
-            "computer's clock was set, or recordings were joined. The senders' timestamps are not "
-            "affected.",
+            "computer's clock was set, or recordings were joined. Timestamps in the messages are "
+            "not affected.",
             "Switch off time synchronisation of the recording computer while recording.",
             {"count": reversals},
         )
@@ -104,8 +107,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if MODEL_NOTE in log.notes:
         yield note(
             "ekf2_simulated",
-            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code. It was run on the "
-            "simulated sensors.",
+            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code.",
             "Use a real flight to assess PX4's EKF2.",
         )
     if not isinstance(ekf2, Ekf2):
@@ -113,8 +115,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if log.autopilot != "PX4":
         yield note(
             "not_px4",
-            f"This log is from {log.autopilot}, not PX4. EKF2 in this report means the estimator "
-            f"of {log.autopilot}. The PX4 parameters named do not exist there.",
+            f"This log is from {log.autopilot}, not PX4. {log.autopilot} does not have the PX4 "
+            "parameters that the report names.",
             'Read "EKF2" in this report as the estimator of this autopilot.',
             {"autopilot": log.autopilot},
         )

@@ -7,6 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
@@ -14,9 +15,9 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
 
 # Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10
-# Maximum ratio of KF's position RMSE after and before the correction of a real time offset
+# Maximum ratio of KF's position RMSE with the time offset corrected to that as flown, for a finding
 MAX_RMSE_RATIO = 1.005
-CORRECT_AT_SENDER = "Correct the timestamps at the sender."
+CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -29,7 +30,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     """Detect a time offset between positions and IMU, constant or changing."""
-    if find_low_pass(analysis) is not None:  # a low pass delays positions without a time offset
+    if find_low_pass(analysis) is not None:  # a low pass delays positions, not timestamps
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
@@ -39,9 +40,9 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
             f"{end_offset_s:+.2f} s (p {clock.change_p_value:.1g}). No single --clock-offset "
-            "corrects both. Until 500 TIMESYNC answers have come, PX4 uses arrival times.",
-            "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
-            "change (--start, --end).",
+            "corrects both. PX4 uses arrival times until it has received 500 TIMESYNC answers.",
+            "Let the clocks synchronise for one minute before take-off. Analyse only the time "
+            "before or after the change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},
         )
         return
@@ -72,7 +73,7 @@ def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | Non
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the position RMSE after a change over that before; NaN without ground truth."""
+    """Return the ratio of the position RMSE with a change to that as flown; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
@@ -94,24 +95,22 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action at the sender."""
+    """Return the action that corrects the timestamps."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
         option_s = clock_offset_option_s(analysis, clock)
         return f"Run again with --clock-offset {option_s:.3f}."
-    size_s = abs(clock.remaining_s)
-    verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
     age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
     horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
     also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
-    return f"{verb} the timestamp (usec) of each position{also}."
+    return f"{format_shift(clock.remaining_s)} the timestamp (usec) of each position{also}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
     """Return the value (s) for ``--clock-offset``.
 
-    For a position file, the time offset that its alignment applied is added.
+    For a position file, this includes the time offset that its alignment already applied.
     """
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)

@@ -38,7 +38,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Findings that remain true if the source is wrong, with CORRECT_FIRST as action
+# Ids of findings that remain true if the source's convention is wrong, with CORRECT_FIRST as action
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -53,12 +53,12 @@ EFFECTS = (
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of fault, message and action
+# Fault of a convention: id of the finding, kind of fault, message and action
 Fault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect axes, units, timestamps and orientations in a wrong convention."""
+    """Detect axes, unit, timestamps or orientation of the source in a wrong convention."""
     convention, faults = analysis.convention, _faults(analysis)
     if convention is None:
         return
@@ -122,8 +122,8 @@ def _position_faults(
     is_file = alignment is not None
     odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     basis = (
-        "The motion measured by the IMU fits this better than any other convention (log likelihood "
-        f"ratio {'above ' if odds == 99.0 else ''}{odds:.0f})."
+        "The motion measured by the IMU fits this convention best (log likelihood ratio to the "
+        f"next one {'above ' if odds == 99.0 else ''}{odds:.0f})."
     )
     stated = alignment.frame.upper() if alignment else "NED"
     axes, turn_deg = axes_as_sent(convention.axes, stated), faults.rotation_deg
@@ -154,7 +154,7 @@ def _position_faults(
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
-            f"orientation by {-turn_deg:+.0f}° before they are sent."
+            f"orientation by {-turn_deg:+.0f}° before sending."
         )
         if is_file:
             action = "Run again with --position-yaw auto."
@@ -171,12 +171,12 @@ def _position_faults(
     if percent:
         message = (
             f"The clock of the position timestamps is {abs(percent):.1f} % "
-            f"{'fast' if percent > 0 else 'slow'}, and {late_s:+.2f} s late in the middle. {basis} "
-            "The analysis uses corrected timestamps."
+            f"{'fast' if percent > 0 else 'slow'}, and the timestamps are {late_s:+.2f} s late in "
+            f"the middle. {basis} The analysis uses corrected timestamps."
         )
         action = (
-            "Take the timestamps from a clock. Timestamps that are counted (frame number over "
-            "nominal rate) drift."
+            "Take timestamps from a clock. Timestamps computed as frame number ÷ nominal rate "
+            "drift."
         )
         yield "source_time_offset_changes", "clock drift", message, action
     elif faults.late_s:
@@ -196,7 +196,7 @@ def _position_faults(
         message = (
             f"The axes of the {positions} are not NED, and ambiguous: {axes_text}; or "
             f"{'; '.join(convention.alternatives[:3])}. The motion of this flight fits each of "
-            "them. Estimates from the positions are left out."
+            "these. px4fuse estimates nothing from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -209,9 +209,9 @@ def _orientation_faults(
         return
     if faults.orientation == "copied":
         message = (
-            "The orientation of the source is the autopilot's own attitude, sent back. The median "
-            "difference is below 0.15°. It contains no measurement, so the source is analysed as a "
-            "positioning system without orientation."
+            "The orientation of the source is the autopilot's own attitude, sent back. The "
+            "median difference is below 0.15°. The orientation contains no measurement, so "
+            "px4fuse ignores it."
         )
         action = (
             "Send no orientation (q NaN), and fuse the position only (EKF2_EV_CTRL without bit 3)."
@@ -219,7 +219,7 @@ def _orientation_faults(
         yield "source_orientation_copied", "copied", message, action
         return
     agreement = (
-        "roll and pitch agree with the vehicle (median difference "
+        "roll and pitch of the orientation agree with the vehicle (median difference "
         f"{orientation.tilt_difference_deg:.1f}°)"
     )
     fault, action = {
@@ -230,18 +230,18 @@ def _orientation_faults(
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {source} is {orientation.frames}; PX4 reads FRD to NED, as the "
-            f"positions are. In that frame {agreement}",
+            f"The orientation of {source} is {orientation.frames}; PX4 reads FRD to NED. As "
+            f"{orientation.frames}, {agreement}",
             describe_conversion(orientation.frames),
         ),
         "heading": (
             f"The heading of the orientation of {source} differs by "
             f"{orientation.heading_error_deg or 0.0:+.0f}° from its own positions (clockwise from "
-            "above). The positions move in another direction than the orientation and the IMU say",
-            "Define the rigid body with x forward. An error of 90° is often an ENU heading, which "
-            "counts from east, that was not converted.",
+            "above). According to IMU and orientation, the positions move in another direction",
+            "Define the rigid body with x forward. An error of 90° is often an unconverted ENU "
+            "heading, which is zero at east.",
         ),
     }[faults.orientation]
     message = f"{fault}. A filter that fuses this yaw gets a wrong heading."
-    action += " Do not fuse the yaw (EKF2_EV_CTRL bit 3) before."
+    action += " Until then do not fuse the yaw (EKF2_EV_CTRL bit 3)."
     yield "source_orientation_wrong", faults.orientation, message, action

@@ -22,11 +22,11 @@ from px4fuse.flight.model import (
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
-# Minimum misalignment in σ for a finding: flights without a fault reach 3.2
+# Minimum yaw misalignment, in σ of its estimate, for a finding: flights without a fault reach 3.2
 MIN_HEADING_SIGMAS = 4.0
-# Minimum misalignment (°) for a finding: the magnetic heading of real flights is wrong by 3 to 4°
+# Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
-# Minimum misalignment (°) for severity error: a quarter of the motion appears on the wrong axis
+# Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
 # Minimum ratio of the heading drift against ground truth to that against the positions
 MIN_TRUE_DRIFT_SHARE = 0.5
@@ -35,7 +35,7 @@ IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
-CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
+CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -49,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of positions in the frame FRD."""
+    """Make the finding of positions in a frame FRD, whose x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
@@ -57,11 +57,11 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         f"{capitalise_first(positions_of(analysis.source))} are in FRD: their x axis is the "
         "heading at start, not north."
     )
-    detail, action = "", f"Read north as the x axis of {name}."
+    detail, action = "", f"In this report, north is the x axis of {name}."
     if isinstance(fusing, Unavailable):
         detail = f"The log does not show whether EKF2 fused the yaw of {name}."
         if log.has_ulog:
-            action += " Add the ULog, which shows whether EKF2 uses the same frame."
+            action += " Give the ULog, too: it shows whether EKF2 uses the same frame."
     elif (
         fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR
     ):
@@ -154,9 +154,9 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first, last = heading.ends
     angles = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
     change = last.heading_error_deg - first.heading_error_deg
-    basis = f"the orientation of {source_name(analysis.source)}"
-    if heading.by != "orientation":
-        basis = "the positions and the IMU"
+    basis = "positions and IMU"
+    if heading.by == "orientation":
+        basis = f"the orientation of {source_name(analysis.source)}"
     possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
     action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
@@ -171,8 +171,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"EKF2's heading drifts by {change:+.0f}° relative to the "
         f"{positions_of(analysis.source)}. It is {angles[0]:+.0f}° from "
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
-        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
-        f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
+        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
+        f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
         f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
@@ -197,5 +197,6 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
             severity,
             "position_file_alignment",
             f"{capitalise_first(sentence.rstrip('.'))}.",
-            "Give --clock-offset, --position-frame and --position-yaw if you know them.",
+            "State time offset, frame and yaw of the file if known (--clock-offset, "
+            "--position-frame, --position-yaw).",
         )

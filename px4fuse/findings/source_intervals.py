@@ -1,6 +1,6 @@
-"""Gaps in the position source, lost positions, and a source that is downsampled.
+"""Findings about gaps in the position source, lost positions, and a downsampled source.
 
-If every second or third position is kept, the intervals equal those of a slower source, so the
+If only every second or third position is sent, the intervals are those of a slower source, so this
 downsampling cannot be detected.
 """
 
@@ -28,30 +28,30 @@ from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
 MIN_LOST_SHARE = 0.02
-# Minimum number of intervals for the detection of downsampling
+# Minimum number of intervals between positions for the detection of downsampling
 MIN_INTERVALS = 50
 # Minimum fraction of missing positions for downsampling: a radio link loses less
 MIN_DOWNSAMPLED_SHARE = 0.25
-# Minimum fraction of intervals with one of two neighbouring multiples of the source's interval.
-# Downsampling to a fixed rate causes such intervals, lost messages do not
+# Minimum fraction of intervals that are one of two neighbouring multiples of the source's interval:
+# downsampling to a fixed rate causes such intervals, lost messages do not
 MIN_NEIGHBOURS_SHARE = 0.85
-# Minimum fraction of intervals with each of these two multiples
+# Minimum fraction of intervals that are the less frequent one of both neighbouring multiples
 MIN_MULTIPLE_SHARE = 0.1
 # Maximum RMS distance of intervals from whole multiples, in intervals of the source: jitter causes
 # 0.03, random intervals 0.29
 MAX_MULTIPLE_RMS = 0.06
-# Maximum tested ratio of the median interval to the interval of the source
+# Maximum tested ratio of the median interval to the interval before downsampling
 MAX_DIVISOR = 4
-# Minimum time (s) in flight without a source that begins late or stops: the land detector is
-# seconds late
+# Minimum time (s) in flight before the first or after the last position for a finding: the land
+# detector is seconds late
 MIN_PARTIAL_S = 3.0
-# Time (s) before a position at which KF has not used the position yet
+# Time (s) before a position to evaluate KF without this position
 SMALLEST_TIME_S = 1e-6
-# Text of the check after a gap in the position source, by kind of source
+# Things to check after a gap in the position source, by kind of source
 CHECKS: Mapping[PositionKind, str] = {
-    "uwb": "line of sight to the anchors and the link",
-    "vio": "light and texture in view of the camera and the link",
-    "mocap": "the markers in view of the cameras and the link",
+    "uwb": "the data link and the line of sight to the anchors",
+    "vio": "the data link, and light and texture in view of the camera",
+    "mocap": "the data link, and the markers in view of the cameras",
     "gnss": "the antenna's view of the sky, its cable and radio interference",
     "file": "the recording of the positions",
 }
@@ -71,7 +71,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     invalid_s = analysis.source.invalid.index
     for span in analysis.events.gaps:
         if np.any((invalid_s > span[0]) & (invalid_s < span[1])):
-            continue  # reported by source_values
+            continue  # source_values reports this gap
         aids = _continuously_fused_aids(ekf2, span)
         if source.origin.aid in aids and source.alignment is None:
             logged_spans.append(span)
@@ -109,10 +109,10 @@ def _longest(gaps: list[Span]) -> tuple[float, float, str]:
 
 
 def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
-    """Return the action for positions that EKF2 fused but the log lacks."""
+    """Return the action for positions that EKF2 fused but that the log of the source lacks."""
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
-            return f"Add --position-source {track.name}, which contains these positions."
+            return f"Run again with --position-source {track.name}, which contains these positions."
     return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
 
 
@@ -123,10 +123,10 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")
     action = "" if stops or source.alignment else " Take off only when positions arrive."
     at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
-    later = f"after {duration_s:.1f} s" if stops else "just before"
+    later = f"after {duration_s:.1f} s" if stops else "just before the first position"
     effect = f", {duration_s:.1f} s {'before the end' if stops else 'after the start'}"
     if "error_m" in at_end:
-        effect = f": EKF2's error is {format_metres(at_end['error_m'])} m {later}"
+        effect = f": EKF2's position error is {format_metres(at_end['error_m'])} m {later}"
     elif "sigma_m" in at_end:
         effect = f": EKF2's reported σ is {format_metres(at_end['sigma_m'])} m {later}"
     has_aids, aiding = _has_aids(analysis.flight.ekf2), ""
@@ -202,7 +202,7 @@ def state_errors_after(analysis: Analysis, gap_s: Span) -> str:
 
 
 def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
-    """Return True if the log shows which aids EKF2 fused."""
+    """Return True if the log shows which aiding sources EKF2 fused."""
     return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
@@ -236,7 +236,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     if len(intervals) > 1 and lost_count / sent_count > MIN_LOST_SHARE:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
-            action += " Or set SDLOG_PROFILE to 129: the ULog then contains what PX4 received."
+            action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
         yield note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
@@ -250,7 +250,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # neither mapped timestamps nor the rate of the logger show the intervals at the receiver
+    # mapped timestamps and a logger with a lower rate do not show the intervals of received
+    # positions
     if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
         return
     intervals, _ = _intervals(analysis)
@@ -284,7 +285,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
         "error" if is_too_slow else "warning",
         "source_downsampled",
         message,
-        "Increase the rate of the stream at the sender (MAVROS, bridge, link), and remove any rate "
+        "Increase the message rate of the positions (MAVROS, bridge, link), and remove any rate "
         "limit.",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base_s, "lost_fraction": lost_share},
     )

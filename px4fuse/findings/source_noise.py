@@ -32,11 +32,14 @@ MIN_REPEAT_SHARE_ERROR = 0.3
 MIN_REPEATS = 10
 # Minimum ratio of the position noises (σ) along north and east for a finding
 MIN_AXIS_RATIO = 1.5
-# Minimum ratio of σ in a part of the flight and in the rest for a warning
+# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for a
+# warning
 MIN_PART_RATIO = 2.0
-# Minimum ratio of σ in a part of the flight and in the rest if outliers are not fused
+# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight,
+# without outliers, for a warning
 MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of σ in a part of the flight and in the rest for severity error
+# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for
+# severity error
 MIN_PART_RATIO_ERROR = 4.0
 
 
@@ -67,7 +70,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     ratio = noise.white_m / float(np.nanmin(assumed_m))
     if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_SHARE * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
-    action = "Check multipath, anchor geometry and filters in the sender."
+    action = "Check multipath, anchor geometry and smoothing in the positioning system."
     if is_gnss:
         action = "Use RTK, or give the antenna a free view of the sky."
     # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
@@ -76,8 +79,8 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
         f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
-        "KF and EKF2 assume independent errors: they follow the correlated part and report a σ "
-        "that is too small. Innovations do not show this part.",
+        "KF and EKF2 assume independent errors: they follow the correlated error and report a σ "
+        "that is too small. Innovations do not show this error.",
         action,
         evidence,
     )
@@ -111,9 +114,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous one. "
-        f"KF and EKF2 use each repetition ({format_percent(share)}) as a new, independent "
-        "measurement, although nothing was measured at that time.",
+        f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous "
+        f"position. KF and EKF2 use each repetition ({format_percent(share)}) as a new, "
+        "independent measurement.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": share},
     )
@@ -122,7 +125,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect different position noise along north and east."""
     if analysis.source.origin.is_gnss:
-        return  # GNSS errors are mostly time-correlated, and SIGMA_Z is their white part
+        return  # GNSS errors are mostly time-correlated; SIGMA_Z estimates only white noise
     known_intervals = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
@@ -145,11 +148,11 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
 
 
 def detect_noise_variation(analysis: Analysis) -> Findings:
-    """Detect a part of the flight in which most innovations are larger."""
+    """Detect a time span of the flight in which most innovations are larger."""
     part = analysis.noisy_part
     if part is None or part.ratio < MIN_PART_RATIO:
         return
-    # a fused outlier increases later innovations, so the ratio without outliers must be large, too
+    # a fused outlier increases later innovations: require a large ratio without outliers, too
     if part.ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS:
         return
     ratio, start, end = part.ratio, part.start_s, part.end_s
@@ -161,8 +164,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         f"{capitalise_first(source_name(analysis.source))} noise is {ratio:.1f} times larger from "
         f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
         "No single SIGMA_Z fits the whole flight.",
-        f"Check {check} in that time. Let the sender report a variance with each position, or "
-        "analyse the parts separately (--start, --end).",
+        f"Check {check} in that time. Let the source send a variance with each position, or "
+        "analyse this time separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

@@ -45,13 +45,13 @@ from px4fuse.flight.model import (
 )
 from px4fuse.flight.position_source import PositionKind
 
-# Minimum extent (m) of the positions, from 5 to 95 %, for a vehicle that moves
+# Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
 MIN_MOTION_RANGE_M = 0.5
-# Extent of white noise in σ, from 5 to 95 %, with a margin of 25 %
+# Extent of white noise in σ (5th to 95th percentile), with a margin of 25 %
 NOISE_RANGE_FACTOR = 1.25 * 3.29
 # Ratio of the median absolute second difference to the σ of white noise
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
-# Minimum gain of the log likelihood for a low pass: flights without a low pass have 0 to 2
+# Minimum gain of the log likelihood by a low pass: flights without a low pass have 0 to 2
 MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum log likelihood of a low pass relative to time-correlated noise without lag
 MIN_LAG_NATS = 1.0
@@ -89,7 +89,7 @@ MIN_OUTLIER_SHARE = 0.005
 MIN_OUTLIER_SHARE_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Minimum fraction of logged innovations for a count of the rejected outliers
+# Minimum fraction of positions with logged innovation, to count rejected outliers
 MIN_INNOVATION_SHARE = 0.75
 # Minimum ratio of reported and estimated position variance, or its inverse, for a warning
 MIN_VARIANCE_RATIO = 2.0
@@ -98,40 +98,42 @@ MIN_VARIANCE_RATIO_ERROR = 3.0
 # Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
-        "another set of anchors, or a new origin",
-        "Keep one origin and one set of anchors in flight.",
+        "a change of the anchors or of the origin",
+        "Do not change origin or anchors in flight.",
     ),
     "vio": (
         "a false map match, or relocalisation in the map",
-        "Keep one map and one origin in flight.",
+        "Do not change map or origin in flight.",
     ),
-    "mocap": ("confused markers, or a new origin", "Keep one origin and one body in flight."),
+    "mocap": (
+        ("confused markers, or a change of the origin"),
+        "Do not change origin or rigid body in flight.",
+    ),
     "gnss": (
-        "another set of satellites, multipath, or a change of the RTK status",
+        "a change of satellites or RTK status, or multipath",
         "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered.",
     ),
-    "file": ("a false map match, or a new origin", "Use one origin for the whole file."),
+    "file": ("a false map match, or a change of the origin", "Use one origin for the whole file."),
 }
 # Possible cause of outliers, and action, by kind of source
 OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
         "reflections without line of sight (NLOS)",
-        "Give the tag line of sight to the anchors, or drop these positions before they are sent.",
+        "Give the tag line of sight to the anchors, or remove outliers before sending.",
     ),
     "vio": (
         "lost visual tracking",
-        "Check light and texture in view of the camera, or drop these positions before they are "
-        "sent.",
+        "Check light and texture in view of the camera, or remove outliers before sending.",
     ),
     "mocap": (
         "hidden or confused markers",
-        "Check the markers in view of the cameras, or drop these positions before they are sent.",
+        "Check the markers in view of the cameras, or remove outliers before sending.",
     ),
     "gnss": (
         "multipath, or a change of the GNSS solution (fix type)",
         "Keep the antenna in free view of the sky, away from walls and interference.",
     ),
-    "file": ("lost or ambiguous tracking", "Remove these rows from the file."),
+    "file": ("lost or ambiguous tracking", "Remove the outliers from the file."),
 }
 
 
@@ -153,7 +155,8 @@ def detect(analysis: Analysis) -> Findings:
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the position source, if it has one."""
     source, low_pass = analysis.source, analysis.source_low_pass
-    # drift of odometry also correlates successive errors, and EKF2 itself filters its positions
+    # drift of odometry also correlates successive errors; positions reconstructed from EKF2 are
+    # filtered
     if source.orientation is not None or source.origin.reconstructed:
         return None
     if (
@@ -164,14 +167,14 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     correlation = analysis.time_correlated_noise
-    # a low pass delays positions: errors that are correlated without a lag have another cause
+    # a low pass delays positions: correlated errors without a lag have another cause
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
         return None
     return low_pass
 
 
 def _is_clock_known(analysis: Analysis) -> bool:
-    """Return True if a lag is not caused by late timestamps."""
+    """Return True if late timestamps cannot explain a lag of the positions."""
     return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_times(analysis))
 
 
@@ -214,7 +217,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
         evidence = {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
         if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
-            cause = "The source announced it (reset_counter): it relocalised or set a new origin."
+            cause = (
+                "The source announced the jump (reset_counter): it relocalised or set a new origin."
+            )
         extent = f"by {size_m:.2f} m"
         steps_m = np.array([[step.value for step in jump.step_m] for jump in large])
         end = "stay there"
@@ -226,9 +231,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
             f"{positions} jump {extent} at {at_s:.1f} s and {end}. The IMU measures no such "
-            f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
-            "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
-            f"{action} Analyse one side of the jump (--start, --end).",
+            f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} After the jump the positions of KF "
+            "and EKF2 are wrong by its size, with consistent innovations.",
+            f"{action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
@@ -316,9 +321,9 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
             "source_scale_error",
             f"{capitalise_first(source_name(analysis.source))} distances are "
-            f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. Compared with "
-            f"the IMU, ± {format_percent(1.96 * sigma)} (95 %). Innovations do not show a scale "
-            "factor error.",
+            f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
+            f"comparison is with the IMU (± {format_percent(1.96 * sigma)}, 95 %). Innovations do "
+            "not show a scale factor error.",
             "Measure a known distance with the source. Then survey the anchors again, and check "
             "unit and calibration.",
             {"scale": 1.0 + excess, "sigma": sigma},
@@ -349,9 +354,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
         "error" if share >= MIN_OUTLIER_SHARE_ERROR else "warning",
         "source_outliers",
         f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
-        f"{format_metres(float(sizes_m.max()))} m. These {format_percent(share, 1)} have a median "
-        f"distance of {format_metres(float(np.median(sizes_m)))} m to {reference}. Possible cause: "
-        f"{possible_cause}. KF has no gate and follows each one.{_rejected(analysis, times_s)}",
+        f"{format_metres(float(sizes_m.max()))} m. The outliers ({format_percent(share, 1)}) have "
+        f"a median distance of {format_metres(float(np.median(sizes_m)))} m to {reference}. "
+        f"Possible cause: {possible_cause}. KF has no gate and follows each "
+        f"outlier.{_rejected(analysis, times_s)}",
         action,
         {"count": count, "share": share, "first_s": times_s[0], "max_m": float(sizes_m.max())},
         zero_length_spans(times_s),
@@ -375,7 +381,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
             reference_time_s, reference_m = true_m.index.to_numpy(), true_m.to_numpy()
         expected_m = np.interp(outlier_time_s, reference_time_s, reference_m)
         squares_m2 += (np.interp(outlier_time_s, time_s, measured_m) - expected_m) ** 2
-    return np.sqrt(squares_m2), "ground truth" if has_truth else "the positions around them"
+    return np.sqrt(squares_m2), "ground truth" if has_truth else "the neighbouring positions"
 
 
 def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
@@ -388,7 +394,7 @@ def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.rate_hz
     count = sum(bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in times_s)
-    return f" EKF2's gate rejected {count} of the {len(times_s)}."
+    return f" EKF2's gate rejected {count} of the {len(times_s)} outliers."
 
 
 def detect_wrong_variance(analysis: Analysis) -> Findings:
@@ -417,17 +423,17 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     if ratio >= MIN_VARIANCE_RATIO and not low <= reported_m <= high:
         direction, doubt = "small" if variance_ratio < 1.0 else "large", ""
         if direction == "large" and error_m is None:
-            doubt = " It may cover time-correlated errors."
+            doubt = " The reported σ may include time-correlated errors."
         severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
-        use = "EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than EKF2_EVP_NOISE."
+        use = "EKF2 uses the reported variance (EKF2_EV_NOISE_MD 0), but at least EKF2_EVP_NOISE²."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-            severity, use = "note", "EKF2 does not use the report (EKF2_EV_NOISE_MD 1)."
+            severity, use = "note", "EKF2 does not use the reported variance (EKF2_EV_NOISE_MD 1)."
         yield finding(
             severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
-            f"{direction}. Reported σ {reported_m:.3g} m; noise {noise_m:.3g} m (95 % {low:.3g} to "
-            f"{high:.3g} m). {use}{doubt}",
+            f"{direction}. The reported σ is {reported_m:.3g} m, the position noise {noise_m:.3g} "
+            f"m (95 % {low:.3g} to {high:.3g} m). {use}{doubt}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,
@@ -449,7 +455,7 @@ def _rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 
 def motion_range_m(comparison: Comparison) -> float:
-    """Return the larger horizontal extent (m) of the positions, 5 to 95 %."""
+    """Return the extent (m) of the positions along north or east, 5th to 95th percentile."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
@@ -474,9 +480,9 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     if hardly_moved(analysis):
         yield warning(
             "no_motion",
-            f"The vehicle moved only {extent_m:.2f} m horizontally. That is the range of 5 to 95 % "
-            "of the positions. Velocity, heading and time offset cannot be estimated from this "
-            "flight.",
+            f"The vehicle moved only {extent_m:.2f} m horizontally. This is the range of the "
+            "positions (5th to 95th percentile). Velocity, heading and time offset cannot be "
+            "estimated from this flight.",
             "Fly several passes of 5 m or more, with clear starts and stops.",
             {"range_m": extent_m} | ({CAUSE: GROUND} if analysis.flight.airborne == () else {}),
         )

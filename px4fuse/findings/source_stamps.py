@@ -20,9 +20,11 @@ MAX_ARRIVAL_AGE_S = 0.001
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: at 1 m/s the noise of good UWB (0.1 m)
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum number of positions with arrival times, and of positions with measurement times
+# Minimum number of positions with arrival times, and with measurement times, to find a
+# synchronisation
 MIN_SAMPLES = 10
-# Minimum fraction of positions with the same kind of timestamp: a few come late
+# Minimum fraction of positions with the same kind of timestamp (arrival, measurement): a few are
+# late
 MIN_CONSISTENT_SHARE = 0.95
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
@@ -42,12 +44,14 @@ def detect(analysis: Analysis) -> Findings:
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
-        kf_times = f"KF uses the sender's timestamps, mapped by the {clock.method}."
+        kf_times = (
+            f"KF uses the timestamps of the messages, mapped to boot time by the {clock.method}."
+        )
         if clock.method == "arrival time":
             kf_times = "KF uses arrival times, too, so its track is late by the position latency."
         yield warning(
             "companion_not_synchronised",
-            f"The sender of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
+            f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
             f"arrival times as times of measurement. {kf_times}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
@@ -62,9 +66,9 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
         "source_timestamps_shared",
         f"The timestamps of the {positions_of(analysis.source)} have a resolution of "
         f"{resolution_s:.3g} s. {count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
-        f"timestamps. px4fuse uses the first sample of each; at 1 m/s a rounded timestamp is an "
-        f"error of up to {format_metres(resolution_s)} m.",
-        "Write the time of measurement with microseconds.",
+        "timestamps. px4fuse uses the first sample of each timestamp. At 1 m/s a rounded "
+        f"timestamp is a position error of up to {format_metres(resolution_s)} m.",
+        "Send the time of measurement with a resolution of microseconds.",
         {"resolution_s": resolution_s, "samples": count, "distinct": distinct_count},
     )
 
@@ -75,14 +79,14 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     effect = ""
     if isinstance(fusing, pd.DataFrame) and not fraction_on(fusing["horizontal"], segment):
-        effect = f"EKF2 never fused the positions: for it they are {STAMP_FAULTS[clock]}. "
+        effect = f"EKF2 never fused the positions: for EKF2 they are {STAMP_FAULTS[clock]}. "
     is_unix = clock.startswith("UNIX") or clock == "another clock"
-    stated = "0 in every message" if clock == "0" else f"in {clock}"
     yield error(
         "source_timestamp_unit",
-        f"The timestamps of the {positions_of(analysis.source)} are {stated}. PX4 expects "
-        "timestamp_sample in microseconds of the autopilot's boot time. "
-        f"{effect}px4fuse uses the arrival times, which are late by the latency.",
+        f"The timestamps of the {positions_of(analysis.source)} are "
+        f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
+        f"in microseconds since the autopilot's boot. {effect}px4fuse uses the arrival times, "
+        "which are late by the latency.",
         SYNCHRONISE if is_unix else SET_TIMESTAMP,
         {"clock": clock},
     )
@@ -96,16 +100,17 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
         f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
         "uses the receive time instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
-        "64-bit integer. A 32-bit float is not precise enough.",
+        "64-bit integer.",
         {"stamps": clock.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
             "source_timestamp_jitter",
-            f"The receive times of the {positions} jitter by {jitter_s * 1e3:.0f} ms (1 σ). They "
-            "replace the timestamps. At 1 m/s this is a position error of "
+            f"The receive times of the {positions} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
+            "px4fuse uses them as timestamps. At 1 m/s this is a position error of "
             f"{format_metres(jitter_s)} m.",
-            "Send the time of measurement in the message, and record close to the sender.",
+            "Send the time of measurement in the message, and record on the computer that "
+            "sends it.",
             {"jitter_s": jitter_s},
         )
 
@@ -127,19 +132,21 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             make_finding = note
         yield make_finding(
             "source_timestamps_are_arrival_times",
-            f"Position timestamps are arrival times until {until_s:.1f} s. Until then TIMESYNC had "
-            "not converged (PX4 needs 500 answers). Later timestamps are times of measurement, "
-            f"{latency_s:.3f} s before arrival; one time offset cannot correct both parts.",
-            "Let the clocks synchronise for one minute before take-off. Analyse the second part "
-            f"(--start {until_s:.0f}).",
+            f"Position timestamps are arrival times until {until_s:.1f} s. Until then TIMESYNC "
+            "had not converged (PX4 needs 500 answers). Later timestamps are times of "
+            f"measurement, {latency_s:.3f} s before arrival, so one time offset cannot correct "
+            "the whole flight.",
+            "Let the clocks synchronise for one minute before take-off. Analyse only the later "
+            f"time (--start {until_s:.0f}).",
             {"until_s": until_s, "latency_s": latency_s},
             ((float(age.index[0]), until_s),),
         )
     elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_SHARE:
         yield warning(
             "source_timestamps_are_arrival_times",
-            "Position timestamps are arrival times in the whole flight. The sender was never "
-            "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
+            "Position timestamps are arrival times in the whole flight. The source was never "
+            "synchronised with the autopilot (TIMESYNC), so every position is late by its "
+            "latency.",
             ANSWER_TIMESYNC,
             {"until_s": float(age.index[-1])},
         )
@@ -153,7 +160,7 @@ def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     """Find the time (s) at which TIMESYNC converged, and the latency (s) of the positions.
 
-    Before this time the timestamps are arrival times. None without such a change.
+    Before this time the timestamps are arrival times. Return None without such a change.
     """
     age = _age_s(analysis)
     if age is None:

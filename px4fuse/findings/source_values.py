@@ -1,4 +1,4 @@
-"""Values of the source that are no measurement: zeros, repeated, rounded, mixed or copied ones."""
+"""Values of the source that are not measurements: zeros, held, rounded, mixed or copied."""
 
 from collections.abc import Mapping
 
@@ -23,13 +23,16 @@ from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_of
 # Minimum rounding step (m) for a finding: smaller steps cause an error (0.29 steps, 1 σ) below the
 # noise of UWB
 MIN_STEP_M = 0.05
-# Minimum distance (m) between two senders for a finding: the noise of good UWB
+# Minimum distance (m) between the positions of two alternating systems for a finding: the noise of
+# good UWB
 MIN_OFFSET_M = 0.1
-# Minimum distance between two senders in σ of its estimate: white noise of one sender reaches 2
+# Minimum distance between the positions of two systems, in σ of its estimate: white noise of one
+# system reaches 2
 MIN_OFFSET_SIGMAS = 4.0
-# Number of samples in which two senders alternate regularly; a lost sample reverses their order
+# Number of samples in a window in which two systems alternate; a lost sample reverses their order
 WINDOW = 16
-# Minimum number of windows: with fewer, outliers of one sender resemble two senders
+# Minimum number of windows in which two systems alternate: with fewer, outliers of one system
+# resemble two systems
 MIN_WINDOWS = 10
 # Maximum median distance (m) from EKF2's position of a copy that EKF2 does not fuse
 MAX_COPY_M = 0.01
@@ -39,21 +42,22 @@ MAX_FOLLOWED_COPY_M = 0.001
 MIN_COPY_SPEED_M_S = 0.2
 # Tested times (s) between EKF2's position and the timestamp of its copy
 DELAYS_S = np.arange(0.0, 0.305, 0.005)
+NO_ESTIMATES = "px4fuse estimates nothing from these positions."
 # Id of the finding, fault and action, by the reason why a row contains no measurement
 INVALID: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
-        "are exactly 0, 0, 0: the sender writes zeros when it has no position",
-        "Send no position (or NaN) while there is none.",
+        "{positions} are exactly 0, 0, 0: the source sends zeros when it has no position",
+        "Send nothing, or NaN, while the position is unknown.",
     ),
     "held": (
         "source_position_held",
-        "repeat the last position: the sender lost tracking and holds it",
-        "Stop sending while tracking is lost, or send NaN (check the state of the tracking).",
+        "{positions} repeat the last position: the source has lost tracking",
+        "Stop sending, or send NaN, while tracking is lost.",
     ),
     "NaN": (
         "source_without_position",
-        "have no position (NaN): the source had no fix",
+        "{positions} are NaN: the source had no fix",
         "",
     ),
 }
@@ -81,14 +85,15 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
     """Detect rows that contain zeros, a repeated last position, or no position."""
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
-    for reason, (name, fault, action) in INVALID.items():
+    for reason, (name, fault_template, action) in INVALID.items():
         time_s = invalid[invalid == reason].index.to_numpy()
         if not (count := len(time_s)):
             continue
         spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
         longest_s = max(spans, key=lambda span: span[1] - span[0])
         duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
-        times = f"{len(spans)} times between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
+        fault = fault_template.format(positions=f"{count} {positions_of(source)}")
+        times = f"{len(spans)} spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         effect, make_finding = "", note if reason == "NaN" else warning
@@ -97,8 +102,8 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             effect = f" {state_errors_after(analysis, _valid_around(analysis, longest_s))}"
         yield make_finding(
             name,
-            f"{count} {positions_of(source)} {fault}. They are sent {times}, {total_s:.1f} s in "
-            f"total. KF does not use them.{effect}",
+            f"{fault}. Times of these positions: {times} ({total_s:.1f} s in total). KF does not "
+            f"use them.{effect}",
             action or f"Check {CHECKS[source.origin.kind]} at {longest_s[0]:.1f} s.",
             {"count": count, "longest_s": duration_s, "total_s": total_s, "at_s": longest_s[0]},
             spans,
@@ -117,7 +122,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     source, step_m = analysis.source, analysis.source.step_m
     if step_m < MIN_STEP_M:
         return
-    cause, action = "They are rounded.", "Send the positions with more digits."
+    cause, action = "The source rounds them.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
         cause = "A 32-bit float has this resolution at large coordinates, such as UTM."
         action = (
@@ -128,7 +133,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
         "source_positions_rounded",
         f"{capitalise_first(positions_of(source))} move in steps of {step_m:.3g} m. {cause} The "
         f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. "
-        "Estimates from the positions are left out.",
+        f"{NO_ESTIMATES}",
         action,
         {"step_m": step_m},
     )
@@ -151,14 +156,13 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # EKF2 did not fuse the file
         sensor = "sensor"
-        action = "Subtract it, rotated by the attitude, from the positions of the file."
+        action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
     yield warning(
         "source_lever_arm",
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
         f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
-        f"lever arm. {_replayed_effect(analysis, change)}Estimates from the positions are left "
-        "out.",
+        f"lever arm. {_replayed_effect(analysis, change)}{NO_ESTIMATES}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
@@ -208,9 +212,9 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     )
     yield error(
         "source_two_senders",
-        f"Two systems send positions in turn that differ by {size_m:.2f} m. Every other one of the "
-        f"{positions_of(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. Estimates "
-        "from the positions are left out.",
+        f"Two systems alternately send positions that differ by {size_m:.2f} m. Every other one "
+        f"of the {positions_of(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. "
+        f"{NO_ESTIMATES}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
         {"distance_m": size_m, "rate_hz": rate_hz},
@@ -252,7 +256,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
 
 
 def _difference_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
-    """Return the median distance (m) of positions from EKF2's position at other times."""
+    """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
     at = state.index.to_numpy()
     curve = CubicHermiteSpline(at, state[Columns.POSITION], state[Columns.VELOCITY])
     is_moving = np.linalg.norm(curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S

@@ -172,6 +172,12 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
     page.write_labelled("Used", f"All columns are evaluated over the time {spans}.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
+    if analysis.uses_estimates and not analysis.changes:
+        text = (
+            "This log does not show a noise or a delay that fits better than EKF2's parameters, so "
+            "nothing is changed. Test another value with --set NAME=VALUE."
+        )
+        page.write_labelled("Change", text)
     head = ["", *column_heads(analysis)]
     page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))
     if sweep_summaries(analysis):

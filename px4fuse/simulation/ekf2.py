@@ -90,7 +90,7 @@ NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log
+# Simulated time (s) at rest before the log starts
 REST_BEFORE_LOG_S = 10.0
 # σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
 # model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
@@ -100,7 +100,8 @@ REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) between times at which the model computes variances for estimator_states
+# Maximum interval (s) between the times at which the model computes the variances of the topic
+# estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -116,7 +117,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     delay_ms = defaults[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     aid_values: dict[str, float] = {aid.noise_mode: 1}
     if is_gnss:
-        # EKF2_MAG_TYPE 1 fuses the magnetic heading only, 0 all axes
+        # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
         mag_type = int(bool(mistakes.heading_deg))
         aid_values = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
         aid_values |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
@@ -127,7 +128,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
             aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
             aid.gate: mistakes.ekf2_gate,
             aid.delay: delay_ms,
-            # samples older than EKF2_DELAY_MAX would not be fused
+            # EKF2 does not fuse samples that are older than EKF2_DELAY_MAX
             "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
             "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
@@ -169,7 +170,8 @@ def simulate_ekf2(
         settings=settings,
         segments=(segment,),
         received=_received_positions(source),
-        # ev_pos_control.cpp: samples are evaluated but not fused without bit 0 of EKF2_EV_CTRL
+        # without bit 0 of EKF2_EV_CTRL, EKF2 tests the samples but does not fuse them
+        # (ev_pos_control.cpp)
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -235,7 +237,8 @@ def _make_segment(
             state=state,
             variance=variance,
             down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
-            # infinite variance: only positions correct the tilt, as there is no logged tilt
+            # infinite variance of the tilt: the model has no logged tilt, so only positions correct
+            # the tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
@@ -271,7 +274,7 @@ def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSample
 def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Compute EKF2's error state and covariance at the start of the log, after a time at rest.
+    """Compute EKF2's error state and covariance at the start of the log, after REST_BEFORE_LOG_S.
 
     PX4's initial covariance is updated with the known values at rest: specific force -g, angular
     rate and velocity 0. This update correlates tilt error and accelerometer bias.
@@ -293,9 +296,9 @@ def _initial_state_at_rest(
 
 
 def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
-    """List the positions in order of arrival, without those older than an earlier one.
+    """List the positions that EKF2 accepts, in order of arrival.
 
-    EKF2 ignores late positions (estimator_interface.cpp).
+    EKF2 ignores a position that is older than the previous one (estimator_interface.cpp).
     """
     fields = source.topic.fields
     timestamp_s, arrival_s = (

@@ -19,13 +19,14 @@ from px4fuse.simulation.ulog_writer import Topic, topic
 # Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
 # simulation (SITL) logs all messages
 VEHICLE_AID_SOURCE_HZ = 2.0
-# Logging rates (Hz) of other topics of PX4 v1.16 (logged_topics.cpp)
+# Logging rates (Hz) of estimator_states, vehicle_local_position and estimator_status_flags on a
+# vehicle (PX4 v1.16, logged_topics.cpp)
 STATES_HZ = 2.0
 LOCAL_POSITION_HZ = 10.0
 FLAGS_HZ = 1.0
 MAGNETOMETER_HZ = 2.0
 OTHER_AIDS_HZ = 2.0
-# Time (µs) from the newest IMU sample to the publication
+# Time (µs) from the newest IMU sample to the publication of EKF2's output
 PUBLICATION_DELAY_US = 100
 
 
@@ -72,7 +73,7 @@ class TopicTrack:
         return sensors.timestamps(sample_us, self.time_us[rows + self.lag_steps] - sample_us)
 
     def logged_events(self, is_message: BoolArray, end_step: IntArray, rate_hz: float) -> IntArray:
-        """Return the indices of events with a message that the logger keeps at a rate (Hz)."""
+        """Return the indices of events with a message that the logger writes at a rate (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
         events = np.flatnonzero(is_message & is_published)
         times_s = sensors.seconds(self.time_us[end_step[events]])

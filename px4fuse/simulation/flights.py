@@ -27,7 +27,7 @@ FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 PROFILE_WITH_VISION = 129
 # SDLOG_PROFILE that does not log the topics of external vision
 PROFILE_DEFAULT = 1
-# PX4 v1.16.0, whose topics are simulated
+# Version number of PX4 v1.16.0, the release whose topics are simulated
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
@@ -71,14 +71,16 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].changes_ekf2 and not scenario.ekf2:
-            raise SettingsError(f"--mistake {name} changes EKF2: omit --no-ekf2.")
+            raise SettingsError(
+                f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
+            )
     if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
         reported_m := sensors.reported_sigma_m(scenario, mistakes)
     ):
         raise SettingsError(
             f"--mistake ekf2-noise={mistakes.ekf2_noise_m:g} has no effect outdoors: "
-            f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({reported_m:g} "
-            "m). Use a larger value."
+            f"EKF2 uses the larger of {GNSS_POS.noise} and the accuracy that the receiver reports "
+            f"({reported_m:g} m). Use a larger value."
         )
     motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
@@ -101,7 +103,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(
-                f"With these injected faults {topic.name} contains no data. Reduce the faults."
+                f"With these injected faults {topic.name} contains no messages. Reduce the faults."
             )
     if scenario.ekf2:
         ekf2_topics = ekf2.simulate_ekf2(

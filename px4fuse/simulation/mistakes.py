@@ -151,8 +151,8 @@ def parse(texts: Iterable[str]) -> Mistakes:
             bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
                 raise SettingsError(
-                    f"--mistake {text}: {value!r}: give {UNIT_NAMES[bounds.unit]}, as in "
-                    f"{name}{mistake.usage}."
+                    f"--mistake {text}: {value!r} is not a valid value: give "
+                    f"{UNIT_NAMES[bounds.unit]}, as in {name}{mistake.usage}."
                 )
             bounds.check(size, f"--mistake {text}: {bounds.cli_name}")
             value_by_field[field] = size
@@ -160,7 +160,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
 
 
 def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
-    """Return the names of the injected faults: their size is not the default."""
+    """Return the names of the faults with a size that is not the default."""
     defaults = Mistakes()
     return tuple(
         name

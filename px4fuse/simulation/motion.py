@@ -1,10 +1,9 @@
 """True motion of a simulated flight: a smooth path, and the attitude of a quadrotor on this path.
 
 Each velocity change is a quintic ramp, so that the acceleration is continuous and the jerk bounded.
-In the air, a
-slow deviation (sum of sines) is added to the path. Thrust is along the body z axis and there is no
-drag, so the direction of the specific force a - g determines roll and pitch (Mellinger and Kumar
-2011, eq. 6 to 8).
+In the air, a slow deviation (sum of sines) is added to the path. Thrust is along the body z axis
+and there is no drag, so the direction of the specific force a - g determines roll and pitch
+(Mellinger and Kumar 2011, eq. 6 to 8).
 """
 
 from __future__ import annotations
@@ -29,16 +28,18 @@ CLIMB_M_S = 0.75
 CLIMB_RAMP_S = 1.5
 # Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
-# Time (s) in which the slow deviation grows after take-off and decreases before landing
+# Time (s) in which the slow deviation from the path grows after take-off and decreases before
+# landing
 FADE_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-# Maximum time (s) between the end of a ramp and the start of the next ramp that continues it
+# Minimum time (s) between two velocity or yaw ramps: a ramp that starts earlier continues the
+# previous ramp
 MIN_RAMP_DISTANCE_S = 1e-9
-# Range of the periods (s) of the sines that are the slow deviation from the path
+# Range of the periods (s) of the sines whose sum is the slow deviation from the path
 DEVIATION_PERIODS_S = (3.0, 20.0)
-# Number of sines in the slow deviation from the path
-DEVIATION_SINE_COUNT = 4
+# Number of sines in a slow deviation or sensor error
+SINE_COUNT = 4
 
 
 def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
@@ -59,7 +60,7 @@ def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of :func:`_ramps`, each of shape (t, k); order -1 is the integral."""
+    """Return derivatives of a result of :func:`_ramps`, shape (t, k); order -1 is the integral."""
     inside_s = np.clip(time_s, *function.x[[0, -1]])
     return [np.asarray(function.derivative(order)(inside_s)) for order in orders]
 
@@ -80,14 +81,12 @@ class Sines:
     cosine: Array
 
     @classmethod
-    def draw(
-        cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float], count: int
-    ) -> Sines:
-        """Draw ``count`` sines with log-uniform periods, random phases, and an RMS per axis."""
+    def draw(cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float]) -> Sines:
+        """Draw SINE_COUNT sines with log-uniform periods, random phases, and an RMS per axis."""
         low, high = np.log(periods_s)
-        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, count))
-        phase = rng.uniform(0.0, 2.0 * np.pi, (count, len(rms)))
-        amplitude = rms * np.sqrt(2.0 / count)
+        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, SINE_COUNT))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (SINE_COUNT, len(rms)))
+        amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def at(self, time_s: Array, orders: int = 1) -> list[Array]:
@@ -142,10 +141,10 @@ class Motion:
     duration_s: float
 
     def at(self, time_s: Array) -> State:
-        """Return the true state at given times, in seconds from the first data."""
+        """Return the true state at the times ``time_s``, which are seconds from the first data."""
         position, velocity, acceleration, jerk = _derivatives(self.velocity, time_s, (-1, 0, 1, 2))
         yaw, yaw_rate = _derivatives(self.yaw, time_s, (0, 1))
-        # factor of the deviation: 1 in the air, 0 on the ground
+        # the deviation is multiplied by a factor that is 1 in the air and 0 on the ground
         fade = _ramps(
             [
                 (self.take_off_s, FADE_S, np.array([1.0])),
@@ -187,7 +186,7 @@ class Attitude:
 def attitude(state: State) -> Attitude:
     """Return the attitude in which the thrust causes the true acceleration, and the rates."""
     gravity = np.array([0.0, 0.0, constants.g])
-    thrust_opposite = gravity - state.acceleration_m_s2  # opposite to thrust
+    thrust_opposite = gravity - state.acceleration_m_s2
     thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite, thrust_opposite))[:, None]
     z = thrust_opposite / thrust_m_s2
     z_rate = -state.jerk_m_s3 / thrust_m_s2
@@ -245,9 +244,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     return Motion(
         velocity=_ramps(flight_plan.path),
         yaw=_ramps(flight_plan.yaw),
-        deviation=Sines.draw(
-            rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT
-        ),
+        deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S),
         take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
         duration_s=float(np.ceil(touch_down_s + TIME_ON_GROUND_S)),

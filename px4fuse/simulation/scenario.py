@@ -13,12 +13,12 @@ Yaw = Literal["fixed", "follow"]
 KINDS: tuple[Kind, ...] = ("aisle", "loop", "outdoor")
 YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 
-# Averaging time (s) of the accelerometer noise SIGMA_A: DT of KF
+# Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle, and of a corner of the loop
 START_STOP_S = 1.5
 CORNER_DURATION_S = 2.0
-# Values that replace defaults of the scenario, by kind of flight
+# Defaults of the scenario that depend on the kind of flight
 DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
@@ -49,7 +49,7 @@ class Bounds:
 
     def check(self, value: float, name: str) -> None:
         """Raise SettingsError if a value is out of range; ``name`` is its name in the message."""
-        if not self.low <= value <= self.high:  # false for NaN too
+        if not self.low <= value <= self.high:  # also True for NaN
             allowed = f"give {self.low:g} to {self.high:g} {self.unit}".rstrip()
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
@@ -150,7 +150,7 @@ class Scenario:
     vio_rate_hz: float = 30.0
     sigma_vio_m: float = 0.01
     vio_drift: float = bounded_number(
-        0.015, 0.0, 0.5, "", "--vio-drift", "VIO drift, as a fraction of the distance."
+        0.015, 0.0, 0.5, "", "--vio-drift", "VIO drift, as a fraction of the distance flown."
     )
     vio_walk_m: float = 0.01
     gnss_rate_hz: float = 5.0

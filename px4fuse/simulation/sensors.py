@@ -20,7 +20,7 @@ from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Boot time (µs) of the first data
+# Time since boot (µs) of the first data
 START_US = 12_000_000
 # Mean latency (s) of positions from measurement to arrival in PX4
 LATENCY_S = 0.030
@@ -30,7 +30,7 @@ LATENCY_SIGMA_S = 0.003
 MIN_LATENCY_S = 0.005
 # Standard deviation of the position measurement times, as a fraction of the source interval
 INTERVAL_JITTER = 0.02
-# Time (s) of the first position
+# Time (s) from the first data to the first position
 FIRST_POSITION_S = 0.1
 # Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
@@ -38,16 +38,16 @@ TIMESYNC_CONVERGED_S = 50.0
 MEAN_BURST_LENGTH = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
-# Age (s) of a GNSS fix at its timestamp
+# Time (s) from the measurement of a GNSS position to its timestamp
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 # Factors on the GNSS noise north, east and down
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # Magnetic field (gauss, NED) at HOME_POSITION
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
-# White noise (1 σ, gauss) and rate (Hz) of the magnetometer
+# White noise (1 σ, gauss) of the magnetometer, and measurement rate (Hz)
 SIGMA_FIELD_GAUSS = 0.02
 FIELD_RATE_HZ = 14.0
-# White noise (1 σ, m) and rate (Hz) of the barometer
+# White noise (1 σ, m) of the barometer, and measurement rate (Hz)
 SIGMA_BAROMETER_M = 0.4
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
@@ -56,20 +56,33 @@ HEIGHT_ERROR_M = 0.03
 HEADING_TIME_CONSTANT_S = 3.0
 # Range of the periods (s) of the sines that are the slow attitude and height errors
 SLOW_ERROR_PERIODS_S = (20.0, 60.0)
-# Number of sines in a slow attitude or height error
-SLOW_ERROR_SINE_COUNT = 4
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
 # Publication interval (µs) of vehicle_land_detected
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
-# Separate streams of random numbers: an injected fault of one sensor does not change the noise of
-# other sensors
+# Random numbers of each sensor and of each kind of error: because the streams are separate, an
+# injected fault of one sensor does not change the noise of other sensors
 Stream = IntEnum(
     "Stream",
-    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
-    "FIELD BAROMETER",
+    [
+        "WANDER",
+        "BIAS",
+        "IMU",
+        "ATTITUDE",
+        "TIMING",
+        "SOURCE",
+        "DRIFT",
+        "NLOS",
+        "VIBRATION",
+        "HEIGHT",
+        "REST",
+        "SLOW",
+        "FIX_VELOCITY",
+        "FIELD",
+        "BAROMETER",
+    ],
     start=0,
 )
 
@@ -81,7 +94,7 @@ def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class SimulatedPositions:
-    """Simulated positions, without those that injected faults remove.
+    """Simulated positions, without the positions that injected faults remove.
 
     Attributes
     ----------
@@ -143,7 +156,8 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
     """Simulate vehicle_magnetometer at the full rate."""
     time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
-    if mistakes.heading_deg:  # a rotated field causes EKF2's heading error
+    # outdoors the measured field is rotated, which causes the heading error of EKF2
+    if mistakes.heading_deg:
         rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
     field_gauss = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_FIELD_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
@@ -167,11 +181,11 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
 def height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow height error (m, positive downward)."""
     rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
-    return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT).at(time_s)[0][:, 0]
+    return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
 def limit_rate(full_topic: Topic, rate_hz: float) -> Topic:
-    """Return the messages that a logger with a rate limit (Hz) keeps; 0 keeps all."""
+    """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
     return _select_messages(full_topic, keep_at_rate(time_s(full_topic), rate_hz))
 
 
@@ -233,7 +247,7 @@ def quaternions(body_to_ned: Array) -> Array:
 def attitude_topic(
     name: str, time_us: NDArray[np.int64], delay_us: int, quaternion: Array
 ) -> Topic:
-    """Make an attitude topic, published ``delay_us`` after the measurement."""
+    """Make an attitude topic that is published ``delay_us`` (µs) after the measurement."""
     return topic(name, timestamps(time_us, delay_us) | {"q": quaternion})
 
 
@@ -242,8 +256,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
-    sines = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT)
-    error = sines.at(time_s)[0]
+    error = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
         size = np.radians(mistakes.heading_deg)
         if mistakes.heading_at_s is not None:
@@ -255,7 +268,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
 
 
 def land_detector(motion: Motion) -> Topic:
-    """Simulate vehicle_land_detected: once a second, and at take-off and landing."""
+    """Simulate vehicle_land_detected, logged once a second and at take-off and landing."""
     changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
     time_us = np.union1d(
         np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), changes_us
@@ -403,10 +416,11 @@ def outliers(
 
 
 def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
-    """Return True for samples that a logger with this rate limit (Hz) keeps; 0: no limit."""
+    """Return a mask of the samples that a logger with a rate limit (Hz) writes; 0 is no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # 1e-6: rounding must not move a sample at the start of a logging interval into the previous one
+    # a logging interval starts 1e-6 intervals early, so that rounding does not move a sample at its
+    # start into the previous interval
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 

@@ -18,9 +18,9 @@ _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# Fields of each topic, one line per field: numpy type, name, and default values. A field without
-# default is optional
-TOPIC_FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
+# Type, default value and length of each field, by topic and field name. A field without default is
+# optional
+TOPIC_FIELDS = table(__file__, "topics.toml", dict[str, dict[str, str]])
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,21 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     table_row : str
         Name in ``topics.toml``, if it differs from the topic name.
     """
-    rows = [["uint64", field] for field in ("timestamp", "timestamp_sample")]
-    rows += [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
-    unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
+    known_fields = {"timestamp": "uint64", "timestamp_sample": "uint64"}
+    known_fields |= TOPIC_FIELDS[table_row or name]
+    unknown_fields = field_values.keys() - known_fields.keys()
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     count, fields = np.size(field_values["timestamp"]), {}
-    for kind, field, *defaults in rows:
-        if field in field_values or defaults:
-            default = float(defaults[0]) if len(defaults) == 1 else np.array(defaults, float)
-            values = np.asarray(field_values.get(field, default))
-            if field not in field_values or not values.ndim:
-                values = np.broadcast_to(values, (count, *values.shape))
-            fields[field] = values.astype(kind)
+    for field, row in known_fields.items():
+        kind, *default = row.split()
+        if field in field_values:
+            values = np.asarray(field_values[field])
+            values = values if values.ndim else np.full(count, values)
+        elif default:
+            values = np.full([count, *map(int, default[1:])], float(default[0]))
+        else:
+            continue
+        fields[field] = values.astype(kind)
     return Topic(name, fields)
 
 
@@ -143,7 +146,7 @@ def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
     # the underscore avoids conflicts of header names with PX4 fields
     dtype = np.dtype([(f"_{name}", kind) for name, kind in header_fields] + topic_fields)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
-    records["_size"] = dtype.itemsize - 3  # ULog sizes exclude the 3 bytes of size and kind
+    records["_size"] = dtype.itemsize - 3  # the size excludes 3 bytes: size and message type
     records["_kind"] = ord("D")
     records["_number"] = topic_id
     for name, values in topic.fields.items():
