@@ -172,7 +172,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{positions_of(analysis.source)}. It is {angles[0]:+.0f}° from "
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
-        f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
+        f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
+        f"{possible_cause}.",
         f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
