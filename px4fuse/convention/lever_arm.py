@@ -48,9 +48,10 @@ class LeverArm(NamedTuple):
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
     """Estimate the lever arm that EKF2's parameters do not contain, from ground truth if logged."""
+    arm = None
     if isinstance(flight.truth, Truth):
-        return _fit_to_truth(flight, flight.truth, track)
-    return None if track.origin.is_gnss else _fit_to_imu(flight, track)
+        arm = _fit_to_truth(flight, flight.truth, track)
+    return arm if arm or track.origin.is_gnss else _fit_to_imu(flight, track)
 
 
 def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
