@@ -316,8 +316,9 @@ def test_evaluate_without_orientation_or_pairs_states_reason() -> None:
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
     assert isinstance(got.ate.rotation_deg, Unavailable)
     for one in got.rpe:
-        assert isinstance(one.translation_m, Unavailable)
-        assert "the estimate has no orientation" in str(one.translation_m)
+        assert not isinstance(one.translation_m, Unavailable)
+        assert isinstance(one.rotation_deg, Unavailable)
+        assert "the estimate has no orientation" in str(one.rotation_deg)
     far = evaluate(reference, reference, rpe_deltas=[Delta(1e4, "m")]).rpe[0]
     assert isinstance(far.translation_m, Unavailable)
     assert "no pair of poses with a distance of 10000 m" in str(far.translation_m)
@@ -357,8 +358,10 @@ def test_evaluate_straight_track_with_vertical_z_aligns_by_yaw() -> None:
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
     assert got.alignment == "yaw"
     assert "along a line" in got.alignment_reason
+    straight = replace(aisle, kind="slam", frame="camera", position_m=x)
     with pytest.raises(TrajectoryError, match="`alignment` yaw"):
-        evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
+        evaluate(straight, aisle, alignment="se3")
+    assert "along a line" in evaluate(straight, aisle).warnings[0]
 
 
 def test_evaluate_camera_track_removes_mounting_rotation() -> None:
@@ -375,7 +378,36 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
                        (camera, replace(reference, rotation=None))):  # fmt: skip
         assert not evaluate(one, other).notes
     for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
-        assert not evaluate(same, reference, alignment="se3").notes
+        assert "a constant 120" in evaluate(same, reference, alignment="se3").notes[0]
+
+
+def test_evaluate_estimate_of_other_body_point_corrects_lever_arm() -> None:
+    reference, arm_m = flight(), np.array([0.4, -0.1, 0.0])
+    mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
+    position_m = reference.position_m + reference.rotation.apply(arm_m)
+    camera = replace(reference, position_m=position_m, rotation=reference.rotation * mounted)
+    got = evaluate(replace(camera, kind="unknown", frame="unknown"), reference)
+    assert "+0.40 m along x, -0.10 m along y" in got.notes[0]
+    assert got.rpe[0].translation_m.rmse < 0.01
+
+
+def test_evaluate_constant_reference_orientation_is_not_scored() -> None:
+    reference = flight()
+    identity = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(reference), 1)))
+    got = evaluate(reference, replace(reference, rotation=identity))
+    assert "no orientation (constant quaternion)" in got.notes[0]
+    assert isinstance(got.ate.rotation_deg, Unavailable)
+    assert got.rpe[-1].translation_m.rmse < 1e-6
+
+
+def test_evaluate_frozen_estimate_scores_the_part_before() -> None:
+    reference = flight()
+    middle, position_m = len(reference) // 2, reference.position_m.copy()
+    position_m[middle:] = position_m[middle]
+    got = evaluate(replace(reference, position_m=position_m), reference)
+    assert "does not change from" in got.warnings[0]
+    assert got.ate.translation_m.count == middle + 1
+    assert got.ate.translation_m.rmse < 1e-6
 
 
 def test_evaluate_with_implausible_arguments_gives_warnings() -> None:

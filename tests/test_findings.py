@@ -263,7 +263,8 @@ TESTED_ELSEWHERE = {
     "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
-    "source_without_position",
+    "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
+    "parameter_changed", "source_height_only", "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {

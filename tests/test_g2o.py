@@ -69,7 +69,7 @@ EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
 NOT_READ, NO_TABLE, NO_VERTEX = (
     "are not supported",
     "columns of numbers",
-    "a vertex id is not an integer of at",
+    "a vertex id is not a 64-bit",
 )
 INVALID_TEXTS = {
     "no edges": ("VERTEX_SE2 0 0 0 0\n", "no edges"),

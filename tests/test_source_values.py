@@ -276,7 +276,7 @@ def test_two_senders_finding_removes_findings_that_depend_on_it():
     ]
     left = source_convention.apply_convention(analysis, findings)
     assert [one.id for one in left] == ["source_two_senders", "ekf2_not_fusing", "imu_gap"]
-    assert left[1].remedy == source_convention.CORRECT_FIRST
+    assert left[1].remedy == source_convention.CORRECT_FIRST.format("position source")
 
 
 def mounted(arm_m: tuple[float, float]) -> Analysis:

@@ -42,6 +42,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
 from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log_name
+from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
@@ -287,6 +288,8 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
+    if is_height_only(analysis.source):
+        return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "
@@ -299,6 +302,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
                     f"The position error of {FILTER_NAMES[verdict.filter]} is "
                     f"{format_ratio(verdict.ratio)} times its reported σ."
                 )
+        sentences += _worst_axis_sentences(analysis)
     if effect.difference_rms_m is not None and (
         not effect.position_rmse_m or all(each.word == "consistent" for each in verdicts)
     ):
@@ -317,6 +321,32 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
         reset_count = format_count(effect.horizontal_resets)
         sentences.append(f"EKF2 reset its horizontal position {reset_count}.")
     return " ".join(sentences)
+
+
+def _worst_axis_sentences(analysis: Analysis) -> list[str]:
+    """Describe EKF2's error along the axis with the largest ratio to σ, besides the main axis.
+
+    Empty if EKF2 is not overconfident along this axis.
+    """
+    errors = {
+        result.axis.label: truth
+        for result in analysis.secondary_axes
+        if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
+        and truth.nees_position_mean
+        and not truth.is_lag_only
+    }
+    if not errors:
+        return []
+    label, worst = max(errors.items(), key=lambda item: item[1].nees_position_mean or 0.0)
+    ratio = math.sqrt(worst.nees_position_mean or 0.0)
+    main_truth = analysis.main.filters["ekf2"].truth
+    main_nees = 0.0 if isinstance(main_truth, Unavailable) else main_truth.nees_position_mean or 0.0
+    if classify_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
+        return []
+    return [
+        f"EKF2's RMSE along {label} is {format_metres(worst.position_rmse_m)} m, "
+        f"{format_ratio(ratio)} times its reported σ."
+    ]
 
 
 def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:

@@ -91,21 +91,25 @@ class ErrorAboveSigma(NamedTuple):
     nees: float
     rmse_m: float
     reported_sigma_m: float
-    nis_mean: float
+    nis_mean: float | None
 
 
 def error_above_reported_sigma(
     summary: FilterSummary | UntestedFilter,
 ) -> ErrorAboveSigma | None:
-    """Return the position error of a filter that exceeds σ without large innovations, else None."""
+    """Return the position error of a filter if it exceeds σ and innovations do not show it.
+
+    Innovations that are not logged along the axis do not show it either.
+    """
     truth = summary.truth
-    if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
+    if isinstance(truth, Unavailable):
         return None
+    nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or truth.is_lag_only or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
+    if nees < MIN_NEES_FINDING or truth.is_lag_only or (nis_mean or 0.0) >= MAX_UNREMARKABLE_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
-    return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)
+    return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
 
 
 @dataclass(frozen=True, kw_only=True)

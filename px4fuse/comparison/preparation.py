@@ -15,9 +15,17 @@ from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    join_flights,
+)
 from px4fuse.flight.position_source import POSITION_FILE
-from px4fuse.readers.mavlink_messages import POSITION_INPUTS
+from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
@@ -30,6 +38,7 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
+GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -266,6 +275,11 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damaged}no external position in this log (no {topics})"
+    gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
+    if gnss is not None:
+        reason += f"; {gnss.source}: {gnss.reason}"
+    if flight.log.autopilot != "PX4":
+        reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
@@ -325,8 +339,16 @@ def choose_segment(
     elif not flight.airborne:
         reason = "whole duration of the position source (the vehicle never took off)"
     else:
-        low, high = flight.airborne[0][0], flight.airborne[-1][1]
+        flights = join_flights(flight.airborne)
+        low, high = max(flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s))
         reason = "positions available and vehicle airborne"
+        if len(flights) > 1:
+            others = ", ".join(
+                f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
+                for start, end in flights
+                if start != low
+            )
+            reason += f"; longest of {len(flights)} flights, the others are {others}"
         if not max(low, first_s) < min(high, last_s):
             low, high = min(low, first_s), max(high, last_s)
             reason = "whole duration of the position source (no positions in flight)"

@@ -162,6 +162,8 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
             )
             for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
         )
+        if axis.name == "down":
+            position = position + _altitude_offset_m(ekf2, position)
         horizon = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
         return horizon[horizon["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
@@ -169,6 +171,17 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
     projected = project(ekf2.record.delayed, axis, segment)
     horizon = projected[["position_m", "position_variance_m2"]].dropna()
     return horizon if len(horizon) else None
+
+
+def _altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
+    """Return the altitude (m) to add to logged heights, if they are altitudes, else 0.
+
+    Since v1.16 EKF2 fuses altitudes above sea level once it has an origin.
+    """
+    published_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
+    altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m
+    distance_m = float((down_m - published_m).median())
+    return altitude_m if abs(distance_m + altitude_m) < abs(distance_m) else 0.0
 
 
 def project_innovations(

@@ -1,4 +1,6 @@
-"""Lever arm from the IMU to the position sensor, from the motion of the sensor in turns."""
+"""Position of the source's sensor relative to the IMU, from ground truth or from turns."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,25 +12,84 @@ from px4fuse.convention.motion import (
     read_inertial,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.flight.model import Columns, Flight, PositionTrack
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.scores import autocorrelation_time
 
 # Minimum lever arm (m) for a finding: twice the noise of good UWB (0.1 m)
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
 MIN_ARM_SIGMAS = 2.5
+# Minimum lever arm (m) and minimum lever arm in σ for a finding from ground truth
+MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS = 0.05, 5.0
+# Maximum lever arm (m) for a finding: a larger one is an error of the frame
+MAX_ARM_M = 5.0
 # Maximum residual, in σ, of a sample that the next fit uses
 CLIPPED_SIGMAS = 3.0
+# Minimum ratio of the singular values of a fit with ground truth
+MIN_SINGULAR_RATIO = 0.02
+# Minimum number of measured coordinates for a fit with ground truth
+MIN_ROWS = 40
 # Number of successive least squares fits, each without the outliers of the previous fit
 ITERATIONS = 4
 
 
-def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, float, float] | None:
-    """Estimate the lever arm of the position sensor in addition to that of EKF2's parameters.
+class LeverArm(NamedTuple):
+    """Distances (m) of the sensor forward and right of the vehicle's origin, and their σ (m)."""
 
-    Return the distances forward and right and their σ (m); None if the lever arm is not
-    significant.
-    """
+    forward_m: float
+    right_m: float
+    sigma_m: float
+
+    @property
+    def size_m(self) -> float:
+        return float(np.hypot(self.forward_m, self.right_m))
+
+
+def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
+    """Estimate the lever arm that EKF2's parameters do not contain, from ground truth if logged."""
+    arm = None
+    if isinstance(flight.truth, Truth):
+        arm = _fit_to_truth(flight, flight.truth, track)
+    return arm if arm or track.origin.is_gnss else _fit_to_imu(flight, track)
+
+
+def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
+    """Fit the errors of the positions against ground truth with a constant and a lever arm."""
+    attitude, columns = flight.attitude, Columns.POSITION[:2]
+    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    samples = track.samples[columns].dropna()
+    if airborne:
+        samples = samples.loc[airborne[0][0] : airborne[-1][1]]
+    if isinstance(attitude, Unavailable) or len(samples) < 2:
+        return None
+    time_s, known = samples.index.to_numpy(), truth.samples
+    true_m = [np.interp(time_s, known.index, known[name], np.nan, np.nan) for name in columns]
+    error_m = samples.to_numpy() - np.transpose(true_m)
+    # late timestamps of a vehicle that flies forward resemble a lever arm
+    velocity_m_s = np.gradient(np.transpose(true_m), time_s, axis=0)
+    quaternions = attitude[Columns.QUATERNION].to_numpy()
+    rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
+    constant = np.broadcast_to(np.eye(2), rotation.shape)
+    design = np.concatenate([rotation, constant, velocity_m_s[:, :, None]], axis=2)
+    is_known = np.isfinite(velocity_m_s).all(axis=1)
+    rows, values = design[is_known].reshape(-1, 5), error_m[is_known].ravel()
+    if len(rows) < MIN_ROWS:
+        return None
+    fit, _, rank, _ = np.linalg.lstsq(rows, values, rcond=MIN_SINGULAR_RATIO)
+    if rank < rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
+        return None
+    residual = (values - rows @ fit).reshape(-1, 2)
+    # successive errors of a source may be correlated
+    excess = max(map(autocorrelation_time, residual.T))
+    covariance = np.linalg.inv(rows.T @ rows) * np.mean(residual**2) * excess
+    sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
+    arm = LeverArm(float(fit[0]), float(fit[1]), sigma_m)
+    is_significant = arm.size_m > max(MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS * sigma_m)
+    return arm if is_significant and arm.size_m < MAX_ARM_M else None
+
+
+def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     inertial = read_inertial(flight)
     samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial is None or len(samples) < 2:
@@ -54,7 +115,6 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, flo
         covariance = np.linalg.pinv(rows.T @ rows) * sigma_m**2 * len(values) / count
         sigma = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual < CLIPPED_SIGMAS * sigma_m
-        time_s = time_s + fit[2]  # fit[2]: time (s) by which timestamps are early
-    forward_m, right_m = fit[:2].tolist()
-    is_significant = np.hypot(forward_m, right_m) > max(MIN_ARM_M, MIN_ARM_SIGMAS * sigma)
-    return (forward_m, right_m, sigma) if is_significant else None
+        time_s = time_s + fit[2]  # fit[2] is the time by which the timestamps are early
+    arm = LeverArm(float(fit[0]), float(fit[1]), sigma)
+    return arm if arm.size_m > max(MIN_ARM_M, MIN_ARM_SIGMAS * sigma) else None

@@ -15,7 +15,7 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
-from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable, step_values_at
+from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, step_values_at
 
 AidVerdict = Literal[
     "consistent",
@@ -55,6 +55,8 @@ NOISE_TOLERANCE = 0.02
 # Minimum height (m) above ground at which innovations are evaluated, or half of the maximum height
 # of a low flight: rotor downwash disturbs the barometer, and PX4's land detector may fail
 MIN_HEIGHT_M = 2.0
+# Number of barometer samples in a running median, which removes noise and gusts
+HEIGHT_MEDIAN_SAMPLES = 11
 
 
 class AidAxis(Record, frozen=True, kw_only=True):
@@ -168,11 +170,11 @@ def flight_span(flight: Flight) -> Span | Unavailable:
         return 0.0, flight.log.duration_s
     if not flight.airborne:
         return Unavailable("EKF2 aids", "the vehicle never took off", "Record a flight.")
-    start = flight.airborne[0][0]
-    end = flight.airborne[-1][1]
-    if isinstance(flight.ekf2, Ekf2):
-        down = flight.ekf2.state["down_m"].loc[start:end]
-        height = (down.iloc[0] if len(down) else 0.0) - down
+    start, end = longest_flight(flight.airborne)
+    # the barometer, because the height of EKF2 may be the fault
+    if flight.barometer is not None:
+        down = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
+        height = (down.dropna().iloc[0] if down.notna().any() else 0.0) - down
         high = height.index[height > min(MIN_HEIGHT_M, height.max() / 2.0)]
         if len(high):
             start = float(high[0])
@@ -336,7 +338,8 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 def _longest_gap(
     times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    ends = np.r_[start_s, times[is_fused], end_s]
+    is_inside = (log.unjudged_s > start_s) & (log.unjudged_s < end_s)
+    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unjudged_s[is_inside])
     starts = ends[:-1]
     is_enabled = np.ones(len(starts), bool)
     if log.enabled is not None:

@@ -228,6 +228,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
+    for name, value in segment.changed.items():  # a chosen value applies to the whole flight
+        is_flown = parameters[name] == inputs.settings[name]
+        parameters[name] = np.where(is_flown, value, parameters[name])
     biases, attitude, has_gate, uses_logged_decisions, uses_reported_noise, fuses_velocity = (
         np.array([getattr(configuration, name) for configuration in configurations])
         for name in (

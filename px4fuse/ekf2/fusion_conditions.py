@@ -86,15 +86,12 @@ class Unmet(NamedTuple):
     reason : str
         Sentences with the values of the log and the limits.
     action : str
-    is_intended : bool
-        True if EKF2 is rightly set not to fuse these positions.
     """
 
     condition: str
     fault: str
     reason: str
     action: str
-    is_intended: bool = False
 
 
 UNKNOWN = Unmet(
@@ -162,13 +159,19 @@ def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
     if value >> bit & 1:
         return
     quantity = "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
-    reason = f"Bit {bit} ({quantity}) of {name} is not set."
-    action = f"Set {name} to {value | 1 << bit}."
-    ranges_m = np.ptp(attempt.source.samples[Columns.POSITION[:2]], axis=0)
-    if is_constant := bool(ranges_m.max() < MAX_CONSTANT_M):
+    reason, action = (
+        f"Bit {bit} ({quantity}) of {name} is not set.",
+        f"Set {name} to {value | 1 << bit}.",
+    )
+    if is_height_only(attempt.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {name} unset."
-    yield Unmet("switch", f"{name} is {value}", reason, action, is_constant)
+    yield Unmet("switch", f"{name} is {value}", reason, action)
+
+
+def is_height_only(source: PositionTrack) -> bool:
+    """Return True if x and y of a source are constant, so that they are no measurement."""
+    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
 
 
 def _check_frame(attempt: Attempt) -> Iterator[Unmet]:

@@ -3,8 +3,9 @@
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as record_field
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,6 +17,7 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
+from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
@@ -205,6 +207,8 @@ class ReplaySegment:
         Ratio of EKF2's internal metres to published metres: north, east and down.
     history : ReplaySegment or None
         Flight before the start, from which the initial correlations are estimated.
+    changed : mapping from PX4's name to float
+        Parameters that were changed in flight before the segment, with their values in it.
     """
 
     time_s: Array
@@ -229,6 +233,7 @@ class ReplaySegment:
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "ReplaySegment | None" = None
+    changed: Mapping[str, float] = record_field(default_factory=dict)
 
     __repr__ = one_line_repr
 
@@ -341,6 +346,8 @@ def find_replay_segments(
     cuts += field_span[1:] if field_span else ()
     # end a segment when the primary EKF2 instance changes, because instances have different states
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
+    changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
+    cuts += [change.time_s for change in changes]
     segments = []
     for low, high in pairwise(np.unique(np.clip(cuts, first_s, end_s))):
         fused_inside = fused_s[(fused_s >= low) & (fused_s <= high)]
@@ -358,8 +365,10 @@ def find_replay_segments(
         if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
         segment_inputs = imu, attitude, ekf2, record
+        changed = {change.name: change.after for change in changes if change.time_s <= low}
         if not is_gnss:
-            segments.append(_make_segment(*segment_inputs, start_row, high))
+            segment = _make_segment(*segment_inputs, start_row, high)
+            segments.append(replace(segment, changed=changed))
             continue
         segment = _make_gnss_segment(*segment_inputs, start_row, high)
         history_row = int(
@@ -370,7 +379,7 @@ def find_replay_segments(
             segment = replace(segment, history=history)
         if field_span and field_span[0] <= states[start_row] and high <= field_span[1]:
             segment = _add_field(segment, record, start_row, ekf2.step_s)
-        segments.append(segment)
+        segments.append(replace(segment, changed=changed))
     return tuple(segments)
 
 

@@ -31,19 +31,25 @@ GAP = "gap"
 # Key in Finding.evidence of findings about axes, unit, clock or orientation of the source, which
 # precede all other findings
 CONVENTION = "convention"
-# Ids of findings after which no estimate from the positions is valid, so they precede all others
+# Findings that precede all others, because no estimate from these positions or this IMU is valid.
+WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
 UNUSABLE = (
+    *WRONG_IMU,
     "source_is_ekf2_estimate",
     "source_two_senders",
     "source_positions_rounded",
     "source_lever_arm",
+    "source_height_only",
+    "source_relocalises",
     "source_timestamps_shared",
 )
 # Key in Finding.evidence of the time (s) at which the source announced a jump by its reset_counter
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
-# Value of CAUSE in the finding no_motion if the vehicle stayed on the ground
+# Causes whose action replaces the actions of their effects
+CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
+# Kind of cause of no_motion: the vehicle stayed on the ground
 GROUND = "never took off"
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
@@ -91,7 +97,9 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
     for cause, effects in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
-        if cause_group is None or WHITE_RATIO in cause_group[0].evidence:
+        if cause_group is None or (cause_group[0].severity == "note" and cause in CORRECTED_FIRST):
+            continue
+        if WHITE_RATIO in cause_group[0].evidence:
             continue
         effect_groups = [
             group
@@ -103,9 +111,9 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         ]
         groups = [group for group in groups if group not in effect_groups]
         for effect, *further_effects in effect_groups:
-            cause_group += [replace(effect, caused_by=cause), *further_effects]
-        # the findings kf_underconfident and kf_overconfident do not increase the severity of a
-        # cause
+            remedy = cause_group[0].remedy if cause in CORRECTED_FIRST else effect.remedy
+            cause_group += [replace(effect, caused_by=cause, remedy=remedy), *further_effects]
+        # kf_underconfident and kf_overconfident do not increase the severity of their cause
         severities = (
             effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES
         )
@@ -123,7 +131,12 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 def _report_rank(group: list[Finding]) -> int:
     # gaps in the recording falsify noise estimates: warnings in RECORDING precede errors in NOISES
     cause = group[0]
-    is_first = CONVENTION in cause.evidence or cause.id in (*UNUSABLE, *MISLEADING, WITHOUT)
+    is_first = CONVENTION in cause.evidence or cause.id in (
+        *UNUSABLE,
+        *MISLEADING,
+        WITHOUT,
+        "ekf2_not_aligned",
+    )
     if is_first and cause.severity != "note":
         return -1
     ranks = {"error": 2 * (cause.id in NOISES), "warning": 3 - 2 * (cause.id in RECORDING)}

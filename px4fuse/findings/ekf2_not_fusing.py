@@ -11,6 +11,7 @@ from px4fuse.ekf2.fusion_conditions import (
     EV_STOP_INTERVAL_S,
     Attempt,
     find_unmet,
+    is_height_only,
 )
 from px4fuse.findings.model import (
     Findings,
@@ -41,6 +42,8 @@ MIN_INVALID_DISTANCE_M = 1.0
 
 def detect(analysis: Comparison) -> Findings:
     """Detect an invalid position of EKF2, and a source that EKF2 does not fuse."""
+    if is_height_only(analysis.source):
+        return
     if isinstance(analysis.flight.ekf2, Ekf2):
         yield from _detect_invalid_position(analysis, analysis.flight.ekf2)
     yield from detect_missing_fusion(analysis)
@@ -89,7 +92,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     if share < MIN_FUSING_SHARE_ERROR:
         is_reference = source.origin.fused_as_gnss and unmet.condition == "switch"
         yield finding(
-            "note" if unmet.is_intended or is_reference else "error",
+            "note" if is_reference else "error",
             "ekf2_not_fusing",
             message,
             action,

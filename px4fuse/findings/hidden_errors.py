@@ -48,6 +48,10 @@ EKF2_REMEDY = (
     "Check delay, heading and other aiding sources of EKF2: KF has a smaller error with the "
     "same positions."
 )
+HEIGHT_REMEDY = (
+    "Check the height sensors that EKF2 fuses (EKF2_HGT_REF) and the accelerometer: KF has a "
+    "smaller height error."
+)
 SHARED_REMEDY = (
     "Check the time offset (px4fuse sync LOG). Then check multipath, the anchor survey and "
     "smoothing in the positioning system."
@@ -115,8 +119,9 @@ def make_error_finding(
     for filter_name in FILTERS:
         label = filter_name.upper()
         for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
+            if excess.nis_mean is not None:
+                evidence[f"{filter_name}_nis_mean"] = excess.nis_mean
             evidence |= {
-                f"{filter_name}_nis_mean": excess.nis_mean,
                 f"{filter_name}_nees_position_mean": excess.nees,
                 f"{filter_name}_position_rmse_m": excess.rmse_m,
                 f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
@@ -155,7 +160,7 @@ def make_error_finding(
     elif is_misaligned:
         remedy = FRAME_REMEDY
     elif is_ekf2_alone:
-        remedy = EKF2_REMEDY
+        remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
     sizes = (f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratios.items())
     title = f"Position errors that innovations do not show: {', '.join(sizes)}"
     return finding(

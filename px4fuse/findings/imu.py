@@ -132,15 +132,22 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
-        is_mavlink = analysis.flight.log.format.startswith("MAVLink")
+        log = analysis.flight.log
+        spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
+        # KF needs IMU and attitude; without a gap in the IMU the attitude is missing
+        missing = "IMU" if spans else "Attitude"
+        action = ""
+        if log.format.startswith("MAVLink"):
+            action = "Record on a link without message loss. "
+        elif log.dropouts:
+            action = "Use a faster SD card. "
         yield warning(
             "imu_gap",
-            f"IMU samples are missing for {gap_s:.2f} s. In this gap KF increases Q to the "
+            f"{missing} samples are missing for {gap_s:.2f} s. In this gap KF increases Q to the "
             "variance of the measured acceleration.",
-            f"{'Record on a link without message loss' if is_mavlink else 'Use a faster SD card'}. "
-            "Or analyse a segment without the gap (--start, --end).",
+            f"{action}Analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
-            _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
+            spans,
         )
 
 

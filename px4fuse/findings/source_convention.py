@@ -21,13 +21,12 @@ from px4fuse.convention.texts import (
 )
 from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE, WRONG_IMU
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
-CORRECT_FIRST = "Correct the position source first."
-# Ids of findings that are false if the source's convention is wrong: they concern EKF2's parameters
-# or the alignment
+CORRECT_FIRST = "Correct the {} first."
+# Findings that are false if the source is wrong: they concern EKF2's parameters or the alignment
 FALSE_AFTER = (
     "ekf2_noise_too_small",
     "ekf2_noise_too_large",
@@ -90,7 +89,10 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             for item in findings
             if item in unusable
             or item.id in EFFECTS
-            or CATALOGUE[item.id].group in UNAFFECTED_GROUPS
+            or (
+                CATALOGUE[item.id].group in UNAFFECTED_GROUPS
+                and (item.id != "accelerometer_bias" or unusable[0].id not in WRONG_IMU)
+            )
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         roots = []
@@ -100,8 +102,9 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     others = [item for item in findings if item not in roots and item.id not in FALSE_AFTER]
     if faults.is_ambiguous and not unusable:
         return [*roots, *(item for item in others if item.id in EFFECTS or item.severity == "note")]
+    action = CORRECT_FIRST.format("IMU" if roots[0].id in WRONG_IMU else "position source")
     effects = [
-        replace(item, message=f"{item.title}.", remedy=CORRECT_FIRST, caused_by=roots[0].id)
+        replace(item, message=f"{item.title}.", remedy=action, caused_by=roots[0].id)
         for item in others
         if item.id in EFFECTS and item.caused_by is None
     ]

@@ -2,13 +2,25 @@
 
 import math
 
+import numpy as np
+
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight.model import Ekf2, Unavailable, positions_of, source_name
+from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    Unavailable,
+    positions_of,
+    source_name,
+)
+from px4fuse.trajectory.rotation import heading as heading_of
+from px4fuse.trajectory.rotation import interpolate
 
 # Minimum yaw misalignment, in σ of its estimate, for a finding: flights without a fault reach 3.2
 MIN_HEADING_SIGMAS = 4.0
@@ -16,8 +28,12 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
+# Minimum ratio of the heading drift against ground truth to that against the positions
+MIN_TRUE_DRIFT_SHARE = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
+# EKF2_MAG_TYPE without magnetometer
+NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
@@ -64,7 +80,8 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect positions that move in another direction than the IMU measures."""
     rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
-        yield _drift_finding(analysis, heading)
+        if not _is_drift_refuted(analysis.flight, heading):
+            yield _drift_finding(analysis, heading)
         return
     limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
     if abs(rotation_deg) < limit_deg or _is_explained_by_bias(analysis):
@@ -73,12 +90,10 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
-        action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
+        action = f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
     elif analysis.source.name == IN_EKF2_FRAME:
-        reason = (
-            "EKF2 fused the positions in this frame; the IMU measures motion in another direction."
-        )
-        action = f"Align the positioning frame with north. Or: {CALIBRATE}"
+        reason = "EKF2 fused them in this frame; the IMU measures the motion in another direction."
+        action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
         reason = (
@@ -87,7 +102,8 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-        action += f" Or: {CALIBRATE}"
+    if not analysis.source.origin.is_gnss and (calibrate := _calibrate(analysis)):
+        action += f" Or: {calibrate}"
     yield finding(
         "error" if abs(rotation_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
@@ -99,11 +115,39 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     )
 
 
+def _calibrate(analysis: Analysis) -> str:
+    """Return the action for the magnetometer; empty if EKF2 does not use it."""
+    mag_type = analysis.flight.log.parameters.get(MAG.switch)
+    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE
+
+
 def _is_explained_by_bias(analysis: Analysis) -> bool:
     fit = analysis.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
     return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
+
+
+def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
+    """Return True if EKF2's heading error against ground truth changes by less than half."""
+    truth, attitude = flight.truth, flight.attitude
+    if (
+        isinstance(truth, Unavailable)
+        or truth.attitude is None
+        or isinstance(attitude, Unavailable)
+    ):
+        return False
+    errors_deg = []
+    for part in heading.ends:
+        samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
+        true = interpolate(
+            samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
+        )
+        error_rad = heading_of(samples.to_numpy()) - heading_of(true)
+        wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
+        errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
+    change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
+    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_SHARE * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
@@ -117,6 +161,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
+    elif analysis.source.orientation is None:
+        action = ""  # the source has no yaw that EKF2 could fuse
     elif not analysis.flight.log.has_ulog:
         action = "Or let the autopilot fuse the yaw of the source."
     return finding(
@@ -128,7 +174,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
         f"{possible_cause}.",
-        f"{CALIBRATE} {action}",
+        f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,

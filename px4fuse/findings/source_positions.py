@@ -15,12 +15,13 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import capitalise_first, format_factor, format_metres
+from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Severity
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
@@ -33,7 +34,15 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight.model import Columns, Unavailable, positions_of, reset_times_s, source_name
+from px4fuse.flight.ekf2_parameters import EV_POS
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Unavailable,
+    positions_of,
+    reset_times_s,
+    source_name,
+)
 from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
@@ -54,8 +63,17 @@ MIN_LAG_ERROR_S = 0.10
 MIN_JUMP_M = 0.2
 # Minimum jump in σ of the time-correlated noise, which changes by up to √2 σ
 MIN_JUMP_SIGMAS = 5.0
-# Maximum time (s) between a jump and the change of reset_counter that announces it: two intervals
-# at 2 Hz
+# Minimum number of announced jumps of a source that relocalises
+MIN_RELOCALISATIONS = 2
+# Maximum time (s) from a jump to the reset of EKF2 that it causes
+MAX_WAIT_S = 5.0
+# Maximum number of jumps whose times are printed
+MAX_LISTED_JUMPS = 8
+# Tolerance (s) for equal times: timestamps have a resolution of 1 µs
+RESET_TOLERANCE_S = 1e-4
+# EKF2_EV_CTRL of a source that measures the height only
+HEIGHT_ONLY_CONTROL = 2
+# Maximum time (s) between a jump and its reset_counter: two intervals at 2 Hz
 MAX_RESET_DISTANCE_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
 MIN_JUMP_ERROR_M = 0.5
@@ -121,7 +139,11 @@ OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
 
 def detect(analysis: Analysis) -> Findings:
     """Detect faults of the positions."""
+    if is_height_only(analysis.source):
+        yield make_height_only_finding(analysis)
+        return
     yield from detect_little_motion(analysis)
+    yield from detect_relocalisation(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
@@ -215,6 +237,69 @@ def detect_jumps(analysis: Analysis) -> Findings:
             evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
+
+
+def make_height_only_finding(analysis: Analysis) -> Finding:
+    """Make the finding of a source with constant x and y."""
+    source, log = analysis.source, analysis.flight.log
+    x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
+    parameter, action = EV_POS.switch, "Action: none, if the source measures only the height."
+    if int(log.parameters.get(parameter, 0.0)) == HEIGHT_ONLY_CONTROL:
+        action = f"Leave {parameter} at {HEIGHT_ONLY_CONTROL} (height only): it is correct."
+    return warning(
+        "source_height_only",
+        f"x and y of {source.name} are constant ({x_m:g}, {y_m:g} m) in the whole flight. Only the "
+        "height is a measurement. The horizontal position is not evaluated.",
+        action,
+        {"x_m": x_m, "y_m": y_m},
+    )
+
+
+def detect_relocalisation(analysis: Analysis) -> Findings:
+    """Detect a source that drifts and jumps back, each time with a rise of its reset_counter."""
+    source, segment, ekf2 = analysis.source, analysis.segment, analysis.flight.ekf2
+    position_m = source.samples[Columns.POSITION[:2]].dropna()
+    time_s, jumps = position_m.index.to_numpy(), []
+    steps_m = np.diff(position_m.to_numpy(), axis=0)
+    for reset_s in reset_times_s(source):
+        row = int(np.searchsorted(time_s, reset_s - RESET_TOLERANCE_S)) - 1
+        if not (segment.start_s < reset_s < segment.end_s and 0 < row < len(steps_m) - 1):
+            continue
+        motion_m = 0.5 * (steps_m[row - 1] + steps_m[row + 1])
+        size_m = float(np.linalg.norm(steps_m[row] - motion_m))
+        if size_m >= MIN_JUMP_M:
+            jumps.append((float(reset_s), size_m))
+    if len(jumps) < MIN_RELOCALISATIONS:
+        return
+    times_s, sizes_m = np.transpose(jumps)
+    resets_s = [
+        reset.time_s
+        for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
+        if reset.quantity == "position" and any(reset.delta[:2])
+    ]
+    waits_s = [
+        min(later)
+        for jump_s in times_s
+        if (later := [at_s - jump_s for at_s in resets_s if 0.0 < at_s - jump_s < MAX_WAIT_S])
+    ]
+    effect = ""
+    if waits_s:
+        effect = (
+            " EKF2 rejects the positions after a jump and resets its position "
+            f"{np.median(waits_s):.1f} s later."
+        )
+    listed = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
+    yield error(
+        "source_relocalises",
+        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and its "
+        f"reset_counter rises at each jump. The jumps are at {listed} s, every "
+        f"{np.median(np.diff(times_s)):.0f} s: the source (VIO or SLAM) drifts and corrects its "
+        f"drift.{effect}",
+        "Improve the tracking of the source (light, texture, calibration of the camera), or "
+        "correct the drift in smaller steps. Analyse the time between two jumps (--start, --end).",
+        {"count": len(jumps), "largest_m": float(sizes_m.max())},
+        zero_length_spans(times_s.tolist()),
+    )
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:

@@ -8,14 +8,17 @@ from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.comparison.remedy import aid_of, format_settings, is_fused_source
 from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
-from px4fuse.flight.model import Columns, Ekf2, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_of, source_name
 
 # Minimum rounding step (m) for a finding: smaller steps cause an error (0.29 steps, 1 σ) below the
 # noise of UWB
@@ -139,18 +142,18 @@ def detect_rounding(analysis: Analysis) -> Findings:
 def detect_lever_arm(analysis: Analysis) -> Findings:
     """Detect a sensor that is mounted away from the IMU without a lever arm in EKF2."""
     source, convention = analysis.source, analysis.convention
-    is_received = source.origin.has_all_samples and not source.origin.is_gnss
-    if not is_received or convention is None or convention.verdict != "determined":
+    has_truth = isinstance(analysis.flight.truth, Truth)
+    is_determined = convention is not None and convention.verdict == "determined"
+    if not source.origin.has_all_samples or not (has_truth or is_determined):
         return
     arm = estimate_lever_arm(analysis.flight, source)
     if arm is None:
         return
     forward_m, right_m, sigma_m = arm
-    sensor = f"{source_name(source)} sensor"
-    action = (
-        f"Set EKF2_EV_POS_X to {source.lever_arm_m[0] + forward_m:.2f} m and EKF2_EV_POS_Y to "
-        f"{source.lever_arm_m[1] + right_m:.2f} m."
-    )
+    values = [known + excess for known, excess in zip(source.lever_arm_m, arm[:2], strict=False)]
+    parameters = aid_of(analysis).lever_arm
+    change = {name: round(value, 2) for name, value in zip(parameters, values, strict=False)}
+    sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # EKF2 did not fuse the file
         sensor = "sensor"
         action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
@@ -159,10 +162,29 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
         f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
-        f"lever arm. {NO_ESTIMATES}",
-        f"Measure the position of the sensor relative to the IMU. {action}",
+        f"lever arm. {_replayed_effect(analysis, change)}{NO_ESTIMATES}",
+        f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
+
+
+def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str:
+    """Return a sentence on EKF2's horizontal error in replays without and with a change."""
+    model, truth = analysis.ekf2_model, analysis.flight.truth
+    if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
+        return ""
+    if not model.agreement.good or not is_fused_source(analysis, model.inputs):
+        return ""
+    sizes_m = []
+    for run in (model.flown, *replay_settings(model, [change])):
+        track = run.published[inside_spans(run.published.index, run.evaluated_s)]
+        errors = [
+            track[name] - np.interp(track.index, truth.samples.index, truth.samples[name])
+            for name in Columns.POSITION[:2]
+        ]
+        sizes_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*errors))))))
+    before, after = map(format_metres, sizes_m)
+    return f"Replay of EKF2 with this lever arm: horizontal position RMSE {before} m → {after} m. "
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -38,6 +38,8 @@ Spans = tuple[Span, ...]
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+# Minimum time (s) on the ground between two flights: the land detector may report short landings
+MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
@@ -409,6 +411,8 @@ class AidLog:
         EKF2 parameters of the aiding source at the start of the log, by PX4 name.
     excluded_count : int
         Number of innovations that were dropped because no variance is near in time.
+    unjudged_s : ndarray
+        Times (s) of rows in older topics from which it is unknown whether EKF2 fused the aid.
     """
 
     topics: tuple[str, ...]
@@ -417,6 +421,7 @@ class AidLog:
     enabled: pd.Series[float] | None
     parameters: Mapping[str, float] = field(default_factory=dict)
     excluded_count: int = 0
+    unjudged_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
@@ -428,6 +433,15 @@ def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> A
     """
     rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[rows]
+
+
+class ParameterChange(NamedTuple):
+    """Change of a PX4 parameter in flight, with the values before and after it."""
+
+    time_s: float
+    name: str
+    before: float
+    after: float
 
 
 @dataclass(frozen=True)
@@ -471,7 +485,9 @@ class Ekf2:
         ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
         ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
     parameters : mapping
-        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
+        All EKF2_ parameters at take-off, by PX4 name, in PX4 units.
+    parameter_changes : tuple of ParameterChange
+        Changes of EKF2_ parameters after take-off, in order of time.
     """
 
     state: pd.DataFrame
@@ -490,6 +506,7 @@ class Ekf2:
     aids: Mapping[str, AidLog] = field(default_factory=dict)
     states: StepFunctions = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
+    parameter_changes: tuple[ParameterChange, ...] = ()
 
     __repr__ = one_line_repr
 
@@ -577,6 +594,22 @@ class Flight:
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
+
+
+def join_flights(airborne: Spans) -> Spans:
+    """Return start and end (s) of each flight; shorter landings do not separate flights."""
+    flights: list[Span] = []
+    for start_s, end_s in airborne:
+        if flights and start_s - flights[-1][1] < MIN_LANDED_S:
+            flights[-1] = (flights[-1][0], end_s)
+        else:
+            flights.append((start_s, end_s))
+    return tuple(flights)
+
+
+def longest_flight(airborne: Spans) -> Span:
+    """Return start and end (s) of the longest flight."""
+    return max(join_flights(airborne), key=lambda span: span[1] - span[0])
 
 
 def time_index(time_s: NDArray[Any]) -> pd.Index[float]:

@@ -28,7 +28,9 @@ _REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "all other lines."
 )
-_VERTEX_ID = re.compile("[+-]?[0-9]{1,18}")
+_VERTEX_ID = re.compile("[+-]?[0-9]{1,19}")
+# Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
+_MAX_VERTEX_ID = 2**63 - 1
 # Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue, due to
 # rounding of the printed digits
 _EIGENVALUE_TOLERANCE = 1e-9
@@ -173,10 +175,15 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines with one tag."""
     vertex_count, value_count = _TAGS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
-    is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
+    is_invalid_id = np.array(
+        [
+            _VERTEX_ID.fullmatch(word) is None or abs(int(word)) > _MAX_VERTEX_ID
+            for word in cells[:, 1:].flat
+        ]
+    )
     rows.raise_where(
         is_invalid_id.reshape(-1, vertex_count),
-        "a vertex id is not an integer of at most 18 digits",
+        "a vertex id is not a 64-bit integer",
         "Give an integer as vertex id.",
     )
     remedy = "Correct or remove this line."

@@ -122,9 +122,10 @@ def _read_gnss(
 
     PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
     next one. px4fuse selects GNSS by default only if the autopilot sends a global position. Return
-    None without fixes.
+    None without messages.
     """
     rows = recording.rows(layout.topic)
+    count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_s = recording.receipt_boot_s(rows)
@@ -133,7 +134,16 @@ def _read_gnss(
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
-        return None
+        few = "none" if fixes.empty else f"only {len(fixes)}"
+        return (
+            px4_positions.unavailable(
+                layout.topic,
+                f"{count} messages, {few} with a 3D fix",
+                "Give the antenna a free view of the sky and wait for a fix.",
+            )
+            if count
+            else None
+        )
     samples = project_to_ned(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
     is_automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())

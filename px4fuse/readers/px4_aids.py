@@ -7,10 +7,12 @@ field names are in ``ekf2_parameters.toml``.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
+from px4fuse.core.arrays import Array
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, DISTURBANCES, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
@@ -112,7 +114,12 @@ def _read_common_topics(
         fields |= _columns_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATIONS, fields)] * 2)
     for values, variances in layouts:
+        innovations = topics.primary_samples(values)
         samples = topics.primary_samples(values, select=_drop_repeats)
+        unjudged_s = _unjudged_times(
+            innovations[f"innovation_{aid.axes[0]}"],
+            topics.primary_samples(variances)[f"variance_{aid.axes[0]}"],
+        )
         if variances is not values:
             # Nearest rows, because the logger decimates each topic separately, and S changes slowly
             variance_samples = topics.primary_samples(variances).dropna()
@@ -123,7 +130,7 @@ def _read_common_topics(
         used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
         log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
         if log is not None:
-            return log
+            return replace(log, unjudged_s=unjudged_s)
     return None
 
 
@@ -132,6 +139,16 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
     finite_samples = samples.dropna()
     first_column = finite_samples.iloc[:, 0]
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
+
+
+def _unjudged_times(innovation: pd.Series, variance: pd.Series) -> Array:
+    """Return the times (s) of rows that do not show an aid as not fused.
+
+    An innovation of 0 means that EKF2 had no sample in this row. A variance that changes shows
+    fusion, even if the innovation in the log is old.
+    """
+    is_changed = (variance > 0.0) & variance.ne(variance.shift())
+    return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
 
 def _columns_by_axis(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:

@@ -140,6 +140,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         aids=aids,
         states=states,
         parameters=topics.ekf2_parameters,
+        parameter_changes=topics.parameter_changes,
     )
 
 

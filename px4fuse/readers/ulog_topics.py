@@ -32,7 +32,7 @@ from px4fuse.flight.ekf2_parameters import (
     replace_invalid_parameters,
 )
 from px4fuse.flight.log import Dropout, LogInfo, Stream
-from px4fuse.flight.model import time_index
+from px4fuse.flight.model import ParameterChange, time_index
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
@@ -190,13 +190,16 @@ class Topics:
         Number of samples with an invalid timestamp, by topic and instance; filled by
         :meth:`read_instance`.
     ekf2_parameters : mapping
-        All EKF2_ parameters by PX4 name; ``log`` contains only the parameters used in results.
+        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters in
+        the results.
     is_cut : bool
         True if the file ends within a message.
     is_damaged : bool
         True if pyulog skipped invalid bytes or messages.
     streams : dict
         Topics and clock of each kind of data in the flight; filled by :meth:`record_stream`.
+    parameter_changes : tuple of ParameterChange
+        Changes of EKF2_ parameters after take-off.
     """
 
     log: LogInfo
@@ -207,6 +210,7 @@ class Topics:
     is_cut: bool
     is_damaged: bool
     streams: dict[str, Stream] = field(default_factory=dict)
+    parameter_changes: tuple[ParameterChange, ...] = ()
 
     def instances(self, topic: str) -> list[int]:
         """Return the sorted instance numbers of a topic with data."""
@@ -439,8 +443,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(time_tables, name)
-    parameter_items = ulog.initial_parameters.items()
-    numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
+    numbers, parameter_changes = _read_parameters(ulog, tables, zero_us)
     parameter_values, parameter_faults = replace_invalid_parameters(numbers)
     log = LogInfo(
         name=name,
@@ -481,8 +484,46 @@ def read_topics(name: str, content: bytes) -> Topics:
     }
     is_cut = source.start < size < source.end
     return Topics(
-        log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
+        log,
+        tables,
+        zero_us,
+        {},
+        MappingProxyType(parameters),
+        is_cut,
+        ulog.file_corruption,
+        parameter_changes=parameter_changes,
     )
+
+
+def _read_parameters(
+    ulog: ULog, tables: Tables, zero_us: int
+) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
+    """Return the parameters at take-off, and the later changes of EKF2_ parameters.
+
+    Without a take-off in the log, the parameters are those at its start.
+    """
+    values = {
+        name: float(value)
+        for name, value in ulog.initial_parameters.items()
+        if isinstance(value, int | float)
+    }
+    layout, take_off_us = LAYOUTS["land_detected"], 0
+    landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
+    if landed is not None and not landed.all():
+        take_off_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
+    changes: list[ParameterChange] = []
+    for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
+        if not isinstance(value, int | float):
+            continue
+        before, changed = values.get(name), float(value)
+        if time_us <= take_off_us or before is None:
+            values[name] = changed
+            continue
+        last = next((change.after for change in changes[::-1] if change.name == name), before)
+        if name.startswith("EKF2_") and last != changed:
+            time_s = (time_us - zero_us) * _MICROSECOND
+            changes.append(ParameterChange(time_s, name, last, changed))
+    return values, tuple(changes)
 
 
 def _read_tables(ulog: ULog) -> Tables:

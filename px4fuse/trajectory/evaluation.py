@@ -16,12 +16,19 @@ from msgspec import structs
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import OrUnavailable, Record
+from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
+from px4fuse.trajectory.artefacts import (
+    ITERATIONS,
+    drop_constant_orientation,
+    find_frozen_poses,
+    has_other_body,
+)
 from px4fuse.trajectory.association import Association, Method, associate
-from px4fuse.trajectory.model import Trajectory, cumulative_distance
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
@@ -147,19 +154,39 @@ def evaluate(
     SettingsError
         A delta is not positive, or not an integer for frames.
     """
+    (estimate, reference), constant_notes = zip(
+        *map(drop_constant_orientation, (estimate, reference)), strict=True
+    )
     offset, offset_warnings = _choose_time_offset(estimate, reference, time_offset_s)
     added_offset_s = offset.offset_s or 0.0
+    is_frozen, frozen_warnings = find_frozen_poses(estimate, reference, added_offset_s)
     matched_estimate, matched_reference, matched = associate(
-        estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=added_offset_s
+        estimate[~is_frozen] if is_frozen.any() else estimate,
+        reference,
+        method=association,
+        max_gap_s=max_gap_s,
+        time_offset_s=added_offset_s,
     )
-    reason = "The user chose the alignment."
+    reason, is_requested = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, reason = choose_alignment(matched_estimate, matched_reference)
-    transform = fit_alignment(matched_estimate.position_m, matched_reference.position_m, alignment)
+    transform, line_warnings = _fit_or_approximate(
+        matched_estimate, matched_reference, alignment, is_requested=is_requested
+    )
     aligned_estimate = matched_estimate.with_positions(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
     aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
+    if not notes and has_other_body(aligned_estimate, matched_reference):
+        matched_estimate, notes = _move_to_reference_body(
+            matched_estimate, matched_reference, alignment
+        )
+        transform = fit_alignment(
+            matched_estimate.position_m, matched_reference.position_m, alignment
+        )
+        aligned_estimate = matched_estimate.with_positions(
+            transform.apply(matched_estimate.position_m), transform.rotation
+        )
     distance_m = cumulative_distance(matched_reference.position_m)
     error_m = np.linalg.norm(aligned_estimate.position_m - matched_reference.position_m, axis=1)
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
@@ -192,8 +219,10 @@ def evaluate(
         estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
         position_error_m=error_m,
-        notes=notes,
+        notes=(*constant_notes[0], *constant_notes[1], *notes),
         warnings=(
+            *frozen_warnings,
+            *line_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
             *_comparison_warnings(matched_estimate, matched_reference, matched, alignment),
@@ -233,15 +262,15 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             f"Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
             f"({frames}), so a tilt is an error."
         )
+    scale = 1.0
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
-        if not is_upright:
-            raise
-        return "yaw", (
-            "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, and "
-            f"z is vertical in both frames ({frames})."
-        )
+        if is_upright:
+            return "yaw", (
+                "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
+                f"and z is vertical in both frames ({frames})."
+            )
     frame_reason = f"the frames {frames} have no common vertical direction"
     if tracks_without_vertical:
         track = tracks_without_vertical[0]
@@ -341,6 +370,63 @@ def _comparison_warnings(
             f"The scale factor of the estimate is {scale:.3g} instead of 1. The alignment "
             f"{alignment} does not correct the scale."
         )
+
+
+def _fit_or_approximate(
+    estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, *, is_requested: bool
+) -> tuple[Transform, tuple[str, ...]]:
+    """Fit the alignment. If the motion does not determine it, use the best fit with a warning.
+
+    Raises
+    ------
+    TrajectoryError
+        The motion does not determine an alignment that the user requested, or has too few poses.
+    """
+    try:
+        return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
+    except TrajectoryError as error:
+        if is_requested or alignment != "se3" or len(estimate) < MIN_POSES:
+            raise
+        transform = umeyama(estimate.position_m, reference.position_m, with_scale=False)
+        return transform, (
+            f"{capitalise_first(error.reason)}. The best fit is used, so the ATE is a lower limit, "
+            "and rotation errors may be wrong.",
+        )
+
+
+def _move_to_reference_body(
+    estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Convert the poses of the estimate to the body of the reference.
+
+    The constant rotation and the lever arm between both bodies are estimated, with the alignment.
+    """
+    assert estimate.rotation is not None
+    assert reference.rotation is not None
+    arm_m, moved = np.zeros(3), estimate
+    for _ in range(ITERATIONS):
+        transform = fit_alignment(moved.position_m, reference.position_m, alignment)
+        # chordal mean (Hartley 2013, section 5.3)
+        body = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
+        error_m = transform.apply(estimate.position_m) - reference.position_m
+        centred_axes = reference.rotation.as_matrix()
+        centred_axes = centred_axes - centred_axes.mean(axis=0)
+        centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
+        arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
+        shift_m = (estimate.rotation * body).apply(arm_m) / transform.scale
+        moved = replace(
+            estimate,
+            position_m=estimate.position_m - shift_m,
+            rotation=estimate.rotation * body,
+        )
+    components = ", ".join(
+        f"{value:+.2f} m along {axis}" for value, axis in zip(arm_m, "xyz", strict=True)
+    )
+    return moved, (
+        f"The orientations differ by a constant {np.degrees(body.magnitude()):.1f}°: the estimate "
+        "has other body axes than the reference, for example those of a camera. Its origin is at "
+        f"{components} of the reference body. Both are corrected before the errors are computed.",
+    )
 
 
 def _with_reference_body_axes(

@@ -230,31 +230,36 @@ def relative_error(
     start, end = find_pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
     analysis_name = f"RPE over {delta}"
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
-    if not isinstance(rotations, Unavailable) and not len(start):
-        rotations = Unavailable(
+    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
+    if not len(start):
+        no_pair = Unavailable(
             analysis_name,
             f"the reference has no pair of poses with a distance of {delta}",
             "Use another distance of RPE pairs (delta).",
         )
-    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
+        return RelativeError(
+            delta.value, delta.unit, all_pairs, "reference", no_pair, no_pair, no_pair
+        )
+    estimate_motion, reference_motion = (
+        track.position_m[end] - track.position_m[start] for track in (aligned_estimate, reference)
+    )
+    overlap = int(np.median(end - start)) if all_pairs else 1
     if isinstance(rotations, Unavailable):
-        scores = rotations, rotations, rotations
+        # without orientations both motions are compared in the frame of the reference
+        translation_m = np.linalg.norm(estimate_motion - reference_motion, axis=1)
+        interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
+        scores = statistics(translation_m), interval_m, rotations
     else:
         estimate_inverse, reference_inverse = (
             rotation_series[start].inv() for rotation_series in rotations
         )
-        estimate_motion = estimate_inverse.apply(
-            aligned_estimate.position_m[end] - aligned_estimate.position_m[start]
-        )
-        reference_motion = reference_inverse.apply(
-            reference.position_m[end] - reference.position_m[start]
-        )
+        estimate_motion = estimate_inverse.apply(estimate_motion)
+        reference_motion = reference_inverse.apply(reference_motion)
         # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
         translation_m = np.linalg.norm(estimate_motion - reference_motion, axis=1)
         estimate_rotation = estimate_inverse * rotations[0][end]
         reference_rotation = reference_inverse * rotations[1][end]
         rotation_deg = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
-        overlap = int(np.median(end - start)) if all_pairs else 1
         interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
         scores = statistics(translation_m), interval_m, statistics(rotation_deg)
     return RelativeError(delta.value, delta.unit, all_pairs, "reference", *scores)

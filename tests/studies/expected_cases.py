@@ -9,6 +9,9 @@ the first finding, and everything that must not be printed. It ends with a count
 - wrong: another finding, or a finding of a clean case
 - none: no finding
 - harmful (in addition): a finding or an action that must not be printed
+
+``../shared/cases/reports`` has its cases in a list. ``report_cases.toml`` contains the expressions
+that their output must and must not contain; a case is half if the output contains only some.
 """
 
 from __future__ import annotations
@@ -19,11 +22,14 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
+import tomllib
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
+REPORT_CASES = Path(__file__).with_name("report_cases.toml")
 TIMEOUT_S = 300.0
 Finding = dict[str, Any]
 
@@ -109,6 +115,57 @@ def judge(case: Finding, findings: list[Finding]) -> tuple[str, Finding | None, 
     return ("none" if first is None else "wrong"), first, harmful
 
 
+def output(command: str, folder: Path) -> str:
+    """Run the commands of a report case; return all texts of their output, one per line."""
+    texts = []
+    for part in command.split(";"):
+        arguments = part.split()[1:]
+        with tempfile.TemporaryDirectory() as made:
+            files = {"evaluate": ["-o", f"{made}/report.pdf"], "compare": ["--json", "-"]}
+            arguments = [word.replace("out.json", f"{made}/out.json") for word in arguments]
+            done = subprocess.run(
+                [sys.executable, "-m", "px4fuse", *arguments, *files.get(arguments[0], [])],
+                cwd=folder,
+                env=os.environ | {"PYTHONPATH": str(ROOT)},
+                capture_output=True,
+                text=True,
+                timeout=TIMEOUT_S,
+                check=False,
+            )
+        text = done.stdout
+        if arguments[0] == "compare" and text.strip():
+            results = json.loads(text)
+            card = results.get("card", {})
+            card_texts = [card.get("effect_text"), card.get("reconcile"), card.get("identity")]
+            texts += [*map(text_of, results["findings"]), *map(str, card_texts)]
+            text = ""
+        texts += [text, done.stderr]
+    return "\n".join(texts)
+
+
+def check_reports(folder: Path, cases: list[Finding], names: list[str]) -> None:
+    """Print the result of each report case: the missing and the forbidden expressions."""
+    expected, counts = tomllib.loads(REPORT_CASES.read_text()), Counter[str]()
+    for case in cases:
+        name = case["file"]
+        if names and not any(part in name for part in names):
+            continue
+        text = output(case["command"].replace("{file}", name), folder)
+        says = expected[name]["says"]
+        missing = [words for words in says if not re.search(words, text)]
+        never = [*map(re.escape, case["must_not_say"]), *expected[name].get("never", [])]
+        forbidden = [words for words in never if re.search(words, text)]
+        result = "correct" if not missing else "half" if len(missing) < len(says) else "none"
+        if not missing and forbidden:
+            result = "half"
+        counts.update([result, *(["harmful"] if forbidden else [])])
+        print(f"{result:8s} {name}", flush=True)
+        for label, words in (("missing", missing), ("harmful", forbidden)):
+            for word in words:
+                print(f"    {label}: {word}", flush=True)
+    print(dict(counts))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT.parent / "shared" / "cases")
@@ -116,6 +173,9 @@ def main() -> None:
     parser.add_argument("--case", nargs="+", default=[])
     options = parser.parse_args()
     cases = json.loads((options.folder / "EXPECTED.json").read_text())["cases"]
+    if isinstance(cases, list):
+        check_reports(options.folder, cases, options.case)
+        return
     counts: Counter[str] = Counter()
     for name, case in cases.items():
         if (options.kind and case["kind"] not in options.kind) or (

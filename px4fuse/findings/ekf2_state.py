@@ -1,0 +1,172 @@
+"""States and flags of EKF2 that explain its errors: biases of the IMU, and missing alignment."""
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres
+from px4fuse.filter.signals import cut_to_segment
+from px4fuse.findings.model import Findings, error, format_percent, fraction_on, spans_with_value
+from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable
+
+# Limits of the bias states (m/s², rad/s): parameter, unit, sensor and columns
+BIAS_STATES = (
+    ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
+    ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
+)
+# Minimum ratio of a bias state and its limit, for a state at the limit
+AT_LIMIT = 0.98
+# Minimum fraction of the flight with a bias state at its limit
+MIN_LIMITED_SHARE = 0.5
+# Length (s) of the windows in which the IMU is tested for rest, and time (s) before take-off that
+# is not tested, because the motors run
+REST_WINDOW_S, RUN_UP_S = 1.0, 0.5
+# Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
+MAX_REST_STD = (0.04, 1.5)
+# Maximum difference (rad/s) between the mean angular rates of the windows at rest
+MAX_REST_CHANGE_RAD_S = 0.01
+# Minimum gyroscope bias (rad/s) that EKF2 does not estimate: its heading turns by 90° in 30 s
+MIN_GYRO_BIAS_RAD_S = 0.05
+GRAVITY_M_S2 = 9.80665
+# Minimum difference (m/s²) between gravity and the specific force at rest
+MIN_GRAVITY_ERROR_M_S2 = 0.3
+# Maximum fraction of the flight without alignment: 2 % of a minute are about 1 s
+MAX_UNALIGNED_SHARE = 0.02
+
+
+def detect(analysis: Analysis) -> Findings:
+    """Detect biases that EKF2 cannot estimate, and a tilt or heading that is not aligned."""
+    ekf2 = analysis.flight.ekf2
+    if not isinstance(ekf2, Ekf2):
+        return
+    at_rest = measure_at_rest(analysis.flight)
+    if not isinstance(ekf2.record, Unavailable):
+        states = cut_to_segment(ekf2.record.delayed, analysis.segment)
+        if len(states):
+            yield from _detect_limited_bias(analysis, ekf2, states, at_rest)
+            yield from _detect_gyro_bias(states, at_rest)
+    yield from _detect_missing_alignment(analysis, ekf2)
+
+
+def measure_at_rest(flight: Flight) -> pd.Series | None:
+    """Return the mean angular rate and specific force at rest before take-off, by column name.
+
+    None without a second of rest.
+    """
+    if not isinstance(flight.imu, pd.DataFrame) or not flight.airborne:
+        return None
+    if isinstance(flight.airborne, Unavailable):
+        return None
+    imu = flight.imu.loc[: flight.airborne[0][0] - RUN_UP_S]
+    windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
+    mean, std = windows.mean(), windows.std()
+    is_at_rest = np.ones(len(mean), bool)
+    for columns, limit in zip(
+        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_REST_STD, strict=True
+    ):
+        is_at_rest &= np.linalg.norm(std[columns], axis=1) < limit
+    mean = mean[is_at_rest]
+    if mean.empty or np.ptp(mean[Columns.ANGULAR_RATE], axis=0).max() > MAX_REST_CHANGE_RAD_S:
+        return None
+    return mean.median()
+
+
+def _detect_limited_bias(
+    analysis: Analysis, ekf2: Ekf2, states: pd.DataFrame, at_rest: pd.Series | None
+) -> Findings:
+    for parameter, unit, sensor, columns in BIAS_STATES:
+        limit = ekf2.parameters.get(parameter, 0.0)
+        shares = (states[columns].abs() >= AT_LIMIT * limit).mean().to_numpy()
+        axis = int(np.argmax(shares))
+        if limit <= 0.0 or shares[axis] < MIN_LIMITED_SHARE:
+            continue
+        bias = float(states[columns[axis]].median())
+        message = (
+            f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
+            f"{format_percent(float(shares[axis]))} of the flight. The estimate is {bias:+.3g} "
+            f"{unit} {BODY_AXES[axis]}; EKF2 cannot estimate a larger bias."
+        )
+        if sensor == "accelerometer" and at_rest is not None:
+            force_m_s2 = float(np.linalg.norm(at_rest[Columns.SPECIFIC_FORCE]))
+            if abs(force_m_s2 - GRAVITY_M_S2) > MIN_GRAVITY_ERROR_M_S2:
+                message += (
+                    f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
+                    f"instead of {GRAVITY_M_S2:.2f}: the bias is "
+                    f"{GRAVITY_M_S2 - force_m_s2:+.2f} m/s² down."
+                )
+        yield error(
+            "ekf2_bias_at_limit",
+            message + (_describe_height_error(analysis, ekf2) if axis == 2 else ""),
+            f"Calibrate the {sensor}s at the temperature of the flight.",
+            {"bias": bias, "limit": limit, "limited_fraction": float(shares[axis])},
+        )
+
+
+def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
+    """Return sentences on EKF2's height error and barometer innovation; empty if unknown."""
+    text, down = "", analysis.axes.get("down")
+    truth = None if down is None else down.filters["ekf2"].truth
+    if isinstance(truth, ErrorsAgainstTruth):
+        text = (
+            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
+        )
+    if (log := ekf2.aids.get(BAROMETER.name)) is not None:
+        innovations = cut_to_segment(log.samples, analysis.segment)[f"innovation_{log.axes[0]}"]
+        text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
+    return text
+
+
+def _detect_gyro_bias(states: pd.DataFrame, at_rest: pd.Series | None) -> Findings:
+    if at_rest is None:
+        return
+    measured: Array = at_rest[Columns.ANGULAR_RATE].to_numpy()
+    estimated: Array = states[Columns.GYRO_BIAS].median().to_numpy()
+    axis = int(np.argmax(np.abs(measured - estimated)))
+    if abs(measured[axis] - estimated[axis]) < MIN_GYRO_BIAS_RAD_S:
+        return
+    direction = ("forward", "right", "down (vertical)")[axis]
+    yield error(
+        "gyroscope_bias",
+        f"The gyroscope measures {measured[axis]:+.2f} rad/s about {direction} at rest. EKF2 "
+        f"estimates only {estimated[axis]:+.3f} rad/s of this bias in flight (median), so its "
+        f"attitude turns by {np.degrees(abs(measured[axis] - estimated[axis])):.0f}°/s.",
+        "Calibrate the gyroscopes, and keep the vehicle at rest during the calibration.",
+        {"measured_rad_s": float(measured[axis]), "estimated_rad_s": float(estimated[axis])},
+    )
+
+
+def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
+    fusing, segment = ekf2.fusing, analysis.segment
+    has_own_yaw = analysis.source.frame == "FRD" or (
+        isinstance(fusing, pd.DataFrame) and fraction_on(fusing["yaw"], segment) > 0.0
+    )
+    has_yaw = analysis.source.orientation is not None
+    for flag, quantity, action in (
+        ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
+        (
+            "yaw_align",
+            "heading",
+            "Calibrate and enable the magnetometer, or "
+            f"{'' if has_yaw else 'send the orientation of the source and '}let EKF2 fuse the yaw "
+            "of the source.",
+        ),
+    ):
+        steps = ekf2.states.get(flag)
+        if steps is None or (flag == "yaw_align" and has_own_yaw):
+            continue
+        share = 1.0 - fraction_on(steps, segment)
+        if share > MAX_UNALIGNED_SHARE:
+            spans = spans_with_value(0.0, steps, segment)
+            until = "" if share > 1.0 - MAX_UNALIGNED_SHARE else f" until {spans[-1][1]:.1f} s"
+            yield error(
+                "ekf2_not_aligned",
+                f"EKF2 has not aligned its {quantity}{until}. cs_{flag} is 0 for "
+                f"{format_percent(share)} of the flight, and EKF2 fuses no position before "
+                f"{'tilt' if flag == 'tilt_align' else 'tilt and heading'} are aligned.",
+                action,
+                {"unaligned_fraction": share, "flag": flag},
+                spans,
+            )

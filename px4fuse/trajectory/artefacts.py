@@ -1,0 +1,78 @@
+"""Properties of a trajectory that are no errors of its estimator: found before it is scored."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from px4fuse.core.arrays import BoolArray
+from px4fuse.trajectory.model import Trajectory
+
+# Maximum rotation (rad) of a constant orientation: rounding of the digits in a file
+MAX_CONSTANT_ROTATION_RAD = 1e-6
+# Minimum number of poses, and minimum motion (m), for a constant orientation
+MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
+# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference in that time
+MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
+# Minimum constant rotation between two bodies, and maximum RMS deviation from it (rad)
+MIN_BODY_ROTATION_RAD, MAX_BODY_DEVIATION_RAD = np.radians(30.0), np.radians(5.0)
+# Number of alternating estimates of alignment and lever arm
+ITERATIONS = 5
+
+
+def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
+    """Remove the orientation of a trajectory that moves without rotating; return also a note."""
+    rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
+    if rotation is None or len(trajectory) < MIN_CONSTANT_POSES or extent_m < MIN_CONSTANT_MOTION_M:
+        return trajectory, ()
+    if (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD:
+        return trajectory, ()
+    return replace(trajectory, rotation=None), (
+        f"{trajectory.name} has no orientation (constant quaternion). Rotations are not scored.",
+    )
+
+
+def find_frozen_poses(
+    estimate: Trajectory, reference: Trajectory, time_offset_s: float
+) -> tuple[BoolArray, tuple[str, ...]]:
+    """Find positions that repeat while the reference moves; return also warnings.
+
+    Returns
+    -------
+    is_frozen : ndarray of bool, shape (n,)
+    warnings : tuple of str
+    """
+    is_frozen, warnings = np.zeros(len(estimate), bool), []
+    is_new = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
+    for start, end in pairwise([*np.flatnonzero(is_new).tolist(), len(estimate)]):
+        start_s, end_s = estimate.time_s[[start, end - 1]].tolist()
+        if end_s - start_s < MIN_FROZEN_S:
+            continue
+        is_inside = (reference.time_s >= start_s + time_offset_s) & (
+            reference.time_s <= end_s + time_offset_s
+        )
+        if not is_inside.any():
+            continue
+        motion_m = float(np.linalg.norm(np.ptp(reference.position_m[is_inside], axis=0)))
+        if motion_m > MIN_FROZEN_MOTION_M:
+            is_frozen[start + 1 : end] = True
+            warnings.append(
+                f"The position of {estimate.name} does not change from "
+                f"{start_s - estimate.time_s[0]:.1f} s to {end_s - estimate.time_s[0]:.1f} s after "
+                f"its start ({(end - start) / len(estimate):.0%} of the estimate), while the "
+                f"reference moves {motion_m:.1f} m. These poses are not scored."
+            )
+    return is_frozen, tuple(warnings)
+
+
+def has_other_body(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
+    """Return True if the orientations differ by a large constant rotation after alignment."""
+    if aligned_estimate.rotation is None or reference.rotation is None:
+        return False
+    difference = aligned_estimate.rotation.inv() * reference.rotation
+    constant = difference.mean()
+    deviation_rad = (constant.inv() * difference).magnitude()
+    return bool(
+        constant.magnitude() > MIN_BODY_ROTATION_RAD
+        and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
+    )
