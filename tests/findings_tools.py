@@ -107,7 +107,14 @@ def analysis(
     if isinstance(ekf2, dict):
         usual_ekf2 = {"states": {}, "parameters": {}, "aids": {}, "record": NONE}
         ekf2 = made(Ekf2, **{**usual_ekf2, **ekf2})
-    usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
+    usual_flight = {
+        "imu": NONE,
+        "attitude": NONE,
+        "positions": (),
+        "streams": {},
+        "airborne": NONE,
+        "truth": NONE,
+    }
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
         (

@@ -162,7 +162,7 @@ def test_card_of_unreadable_log_shows_first_bytes_and_action(tmp_path) -> None:
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
         "  read     1,200 bytes; the file begins with A3 95 80 01, a ULog with 55 4C 6F 67",
-        "  fix      Give the .tlog that the ground station wrote.",
+        "  fix      Give the MAVLink recording (.tlog) of the ground station.",
         "No file was written. Exit code 2.",
     ]
     missing = build_refusal_card(LogError("b.ulg: cannot be read"), tmp_path / "b.ulg")

@@ -5,6 +5,8 @@ The limits are repeated here, so that a change in the code needs a change in the
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -94,7 +96,7 @@ def test_ekf2_parameter_check_accepts_limits_of_range(name, fits, not_fits):
         assert check_parameters({name: value}) == {name: value}
     for value in not_fits:
         unit = {"EKF2_EVP_GATE": " SD", "EKF2_EV_POS_X": " m"}.get(name, "")
-        with pytest.raises(SettingsError, match=rf"{unit} is outside|Give 0 or 1"):
+        with pytest.raises(SettingsError, match=rf"{unit} is outside|is neither 0 nor 1"):
             check_parameters({name: value})
 
 
@@ -172,7 +174,7 @@ def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
 def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
     time = 10.0 + interval_s * np.arange(30)
     samples = pd.DataFrame(1.0, index=time, columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    usual = {"frame": "NED", "orientation": None, "topics": (name,)}
+    usual = {"frame": "NED", "orientation": None, "topics": (name,), "status": pd.DataFrame()}
     return made(PositionTrack, name=name, origin=origin, samples=samples, **{**usual, **parts})
 
 
@@ -374,8 +376,10 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     }  # fmt: skip
     given = SimpleNamespace(**{**usual, **parts})
 
-    def keep(_imu: Any, _attitude: Any, _ekf2: Any, record: Any, at: int, high: float) -> None:
+    def keep(*inputs: Any) -> ReplaySegment:
+        *_, record, at, high = inputs
         found.append((float(record.delayed.index[at]), round(float(high), 2)))
+        return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
     imu, fused, delayed = (

@@ -495,10 +495,12 @@ def test_misaligned_frame_finding_gives_rotation_to_apply() -> None:
 
 def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
-    for has_ulog in (True, False):
-        one = analysis(heading=drifting, log=log(has_ulog=has_ulog))
+    for has_ulog, orientation in ((True, object()), (False, object()), (True, None)):
+        sent = source(orientation=orientation)
+        one = analysis(heading=drifting, log=log(has_ulog=has_ulog), source=sent)
         finding = only(source_frame.detect, one)
-        assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is has_ulog
+        has_yaw_of_source = has_ulog and orientation is not None
+        assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is has_yaw_of_source
     assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message

@@ -115,12 +115,10 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_constant_positions_without_fusion_are_only_a_note() -> None:
+def test_constant_positions_that_ekf2_does_not_fuse_are_no_finding() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
-    finding = only(ekf2_not_fusing.detect, still)
-    assert finding.severity == "note"
-    assert finding.remedy == "Leave bit 0 of EKF2_EV_CTRL unset."
+    assert named(ekf2_not_fusing.detect, still) == {}
 
 
 def test_position_file_not_sent_to_ekf2_has_no_fusion_finding() -> None:

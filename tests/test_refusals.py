@@ -155,7 +155,10 @@ REFUSED = {
                 "--sweep EKF2_EVP_NOISE=0.1:0.2:1",
                 "1 parameter values for a sweep: give a number from 2 to 200",
             ),
-            ("--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2", "set and swept"),
+            (
+                "--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2",
+                "has both a new value and a sweep",
+            ),
             ("--from 60", "--from requires --without AID"),
         )
     },
@@ -229,7 +232,6 @@ REFUSED = {
     "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
     "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: the file is neither a PX4 ULog"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "0 poses match in time"),
-    "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
     "offset of words": ("evaluate s.tum s.tum --time-offset abc", "Give for example 0.1, or auto."),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": (

@@ -180,7 +180,7 @@ class TestForm:
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3
         assert "mistakes 30 of 30, sizes 0 of 15" in comment
-        assert "You named dropout, which is right." in comment
+        assert "you named dropout, which is right: " in comment.lower()
         points, comment = check_points("answers", with_form(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
         assert (

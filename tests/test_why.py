@@ -58,7 +58,7 @@ def test_kf_setting_changes_only_its_part_of_kf_ekf2_difference(sample: Analysis
     assert NOISE not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
     assert TIMESTAMPS in late.sentences[0]
-    assert "KF 300 ms" in late.sentences[0]
+    assert "300 ms" in late.sentences[0]
     left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
@@ -119,7 +119,7 @@ def test_kf_ekf2_difference_sentence_states_largest_step(sample, share, text) ->
     assert f" and is {text}" in explained.sentences[0]
     assert explained.cause.endswith(f"Reason of {first.name}.")
     assert explained.sentences[0].startswith(explained.cause)
-    assert f" m at {first.moved_at_s:.1f} s." in explained.sentences[0]
+    assert f" m (at {first.moved_at_s:.1f} s)" in explained.sentences[0]
 
 
 def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> None:

@@ -58,7 +58,7 @@ def line_error(name: str, number: int, fault: str, remedy: str) -> TrajectoryErr
     """Make an error about one line of a file.
 
     >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
-    "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
+    "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
     """
     return TrajectoryError(f"{name}, line {number}: {fault}. {remedy}")
 
