@@ -60,7 +60,8 @@ def make_desk(folder: Path) -> Path:
     for name, content in {
         "l.ulg": log, "logs/x.ulg": log,
         "pos.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
-        "notes.md": b"words", "form.toml": form_text("l.ulg", hashlib.sha256(log).hexdigest()).encode(),
+        "notes.md": b"words",
+        "form.toml": form_text("l.ulg", hashlib.sha256(log).hexdigest()).encode(),
         "r.pdf": report, "subs/s1.pdf": report,
         "subs/in/s2.pdf": report, "q.json": REPORT.with_suffix(".json").read_bytes(),
         "a.tum": (SAMPLES / "loop_slam.tum").read_bytes(),
