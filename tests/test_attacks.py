@@ -223,7 +223,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
     "log of another student": (
-        set_value("b" * 64, "log", "sha256"), "other log", "given to student s02",
+        set_value("b" * 64, "log", "sha256"), "other log", "assigned to student s02",
     ),
     "better NIS": (
         set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
@@ -241,7 +241,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
     # the cover prints the id, and its font contains the letters of the cover only
-    "the id of another student": (forge_owner, "cannot verify", "given to student s01"),
+    "the id of another student": (forge_owner, "cannot verify", "assigned to student s01"),
     "another student on the card": (
         set_value("Eve", "card", "identity", "student"), "numbers differ", "",
     ),

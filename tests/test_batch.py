@@ -166,7 +166,7 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
     assert "f1.ulg" in twin["reason"]
     assert of["broken.ulg"].loc[0, "status"] == of["dataflash.BIN"].loc[0, "status"] == "failed"
     assert "DataFlash" in of["dataflash.BIN"].loc[0, "reason"]
-    assert of["dataflash.BIN"].loc[0, "remedy"].startswith("Give the .tlog")
+    assert of["dataflash.BIN"].loc[0, "remedy"].startswith("Give the MAVLink recording")
 
     assert_same(pd.read_parquet(output / "fleet.parquet"), table)
     na_values = {name: [""] for name, kind in COLUMN_TYPES.items() if kind != "str"}
@@ -411,7 +411,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     found = analysed(log.address)
     assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
     (small,) = analysed(log.address, max_bytes=10).rows
-    assert small["reason"] == "the file has 1 MB, more than the limit of 0 MB"
+    assert small["reason"] == "the file has 1 MB; the limit is 0 MB"
 
 
 @pytest.mark.reallogs
@@ -495,7 +495,7 @@ def assert_cluster_gives_the_same_table(address, flights, undisturbed, tmp_path)
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
     with started_worker(address, tmp_path / "third", path):
-        assert "has px4fuse 9.9; this computer has" in error_line("batch", *arguments)
+        assert "px4fuse version: 9.9 on Dask worker" in error_line("batch", *arguments)
 
 
 def assert_failed_job_does_not_affect_others(address):

@@ -394,9 +394,9 @@ def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
             logged = truth["estimator_innovations"]
             stated[aid] = [logged[field]["mean_nis"] for field in fields]
     for aid, expected in stated.items():
-        # the flight begins one metre above ground here, at take-off in the reference
+        # the flight begins above the ground by the barometer here, at take-off in the reference
         nis = [axis.nis_mean for axis in found[aid].axes.values()]
-        assert nis == pytest.approx(expected, rel=0.02, abs=0.002), aid
+        assert nis == pytest.approx(expected, rel=0.03, abs=0.002), aid
     return len(stated)
 
 

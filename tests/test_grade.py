@@ -19,7 +19,7 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.classroom.assignment.key import Answer, AnswerKey
 from px4fuse.classroom.assignment.roster import file_names
-from px4fuse.classroom.grading.entries import Course
+from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Entry, GradedReport
 from px4fuse.classroom.grading.rubric import read_rubric
@@ -247,7 +247,7 @@ def test_grade_command_passes_all_course_options(tmp_path, monkeypatch) -> None:
     assert course.worksheets[0].head == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert (course.late_rule.text, course.include_pending) == ("5%/hour", False)
+    assert (course.late_rule, course.include_pending) == (parse_late_rule("5%/hour"), False)
 
 
 def test_grade_write_rubric_does_not_overwrite_existing_file(tmp_path, monkeypatch) -> None:

@@ -140,7 +140,7 @@ def _system_error(error: OSError, written: str) -> Px4FuseError:
         return OutputError(
             f"The file {error.filename} cannot be used ({error.strerror}); {written}"
         )
-    return OutputError(f"standard output: cannot be written ({error.strerror}); {written}")
+    return OutputError(f"standard output cannot be written ({error.strerror}); {written}")
 
 
 def _check_memory() -> None:
@@ -194,7 +194,7 @@ def main() -> None:
         _abandon_output()
         exit_code = 0
     except OSError as error:  # click cannot print --help or --version
-        _print_error(f"standard output: cannot be written ({error.strerror}); nothing was written.")
+        _print_error(f"standard output cannot be written ({error.strerror}); nothing was written.")
         exit_code = 2
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
 
@@ -216,7 +216,7 @@ def _flush_output(exit_code: int) -> int:
     except OSError as error:
         _abandon_output()
         if exit_code == 0:  # with another exit code, px4fuse has already printed an error
-            _print_error(f"standard output: cannot be written ({error.strerror}).")
+            _print_error(f"standard output cannot be written ({error.strerror}).")
             return 2
     return exit_code
 

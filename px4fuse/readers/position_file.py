@@ -318,7 +318,9 @@ def _read_numbers(
     named_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
     texts = table.texts([*chosen_columns, *quaternion_columns, *named_columns])
     texts = _select_body(table, texts, meanings, body)
-    numbers = texts.apply(_to_numbers, is_comma_decimal=table.separator != ",")
+    is_comma_decimal = table.separator != ","
+    # without rows, apply returns objects
+    numbers = texts.apply(_to_numbers, is_comma_decimal=is_comma_decimal).astype(np.float64)
     has_zone = True
     for index in chosen_columns[:1] or [i for i in named_columns if meanings[i].kind == "time"]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
