@@ -261,9 +261,10 @@ def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
     for name in TITLES:
         rows = table[table["finding"] == name]
         clean = rows[rows["condition"] == "none"]
+        finding = made[name].finding if name in made else None
         contents[name] = {
-            "message": made[name].finding.message,
-            "remedy": made[name].finding.remedy,
+            "message": "" if finding is None else finding.message,
+            "remedy": "" if finding is None else finding.remedy,
             "clean_flights": int(clean["flights"].sum()),
             "false_alarms": round(float((clean["flights"] * clean["rate"]).sum())),
             "detection": {

@@ -486,7 +486,7 @@ def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatc
 
 def test_explain_unmeasured_finding_prints_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
-    assert "Detection is not measured" in out
+    assert "detection are not measured" in out
 
 
 def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys) -> None:

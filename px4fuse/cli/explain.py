@@ -53,8 +53,9 @@ def _finding_page(finding_id: str) -> Page:
     page = Page()
     page.write(f"{entry.title}  [{name}]", bold=True)
     page.write_labelled("Meaning", entry.meaning)
-    page.write_labelled("Example", example.message)
-    page.write_labelled("Action", example.remedy)
+    if example.message:
+        page.write_labelled("Example", example.message)
+        page.write_labelled("Action", example.remedy)
     for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
         if names:
             page.write_labelled(label, ", ".join(names))
@@ -66,9 +67,7 @@ def _finding_page(finding_id: str) -> Page:
 
 def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:
     if not clean_flights:
-        return [
-            "Detection is not measured: this finding states a property of the log or a setting."
-        ]
+        return ["False alarms and detection are not measured for this finding."]
     detected = "; ".join(
         f"{mistake}: {100.0 * fraction:.0f} %" for mistake, fraction in detection.items()
     )
