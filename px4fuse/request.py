@@ -301,7 +301,7 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Options for names of Python arguments in errors that are not in OPTION_NAMES
+# Option of each Python argument that errors name and that OPTION_NAMES does not contain
 _ARGUMENTS = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 

@@ -85,7 +85,7 @@ class TestDraw:
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_assigned_flight_of_fixed_secret_equals_reference(self):
+    def test_assigned_flight_with_given_secret_equals_reference(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing

@@ -295,7 +295,7 @@ def test_grade_report_with_forged_results_is_not_verified(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_grade_overpainted_page_is_scored_from_redrawn_report(
+def test_grade_of_pdf_with_overpainted_page_uses_log_results(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
     """The numbers are verified and the page is not; the redrawn report is scored."""

@@ -29,7 +29,7 @@ def test_sigma_ratio_text_plot_marks_ratio_at_its_column(ratio, column, mark) ->
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
-def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
+def test_text_axis_without_sigma_ratio_shows_consistent_band() -> None:
     assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
     assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
 

@@ -320,7 +320,7 @@ def test_clipped_acceleration_has_noise_of_4_9_m_s2() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_bad_acceleration_fraction_is_that_of_clipped_imu_axes() -> None:
+def test_bad_acceleration_fraction_equals_clipped_imu_fraction() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)

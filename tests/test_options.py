@@ -62,7 +62,7 @@ def outcome(request: ComparisonRequest) -> str:
     return repr((*inputs, source.description, compared.segment, compared.settings, numbers))
 
 
-def test_tested_option_values_include_each_field_of_request() -> None:
+def test_this_file_has_a_value_for_each_field_of_a_request() -> None:
     assert set(CHANGED) == set(ComparisonRequest.__struct_fields__)
 
 

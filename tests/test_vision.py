@@ -275,7 +275,7 @@ def test_vision_position_bias_estimates_frame_offset() -> None:
         assert done.state[-1, 0, 6 + axis] == pytest.approx(true, abs=0.5)
 
 
-def test_vision_jump_is_rejected_until_its_bias_is_reset() -> None:
+def test_ekf2_rejects_vision_jump_until_position_bias_is_reset() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])

@@ -37,7 +37,7 @@ class DiffInput:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[DiffInput, DiffInput]:
-    """Read the inputs A and B; analyse a log with the settings in the results of the other input.
+    """Read the inputs A and B; a log is analysed with the settings of the other input.
 
     Raises
     ------

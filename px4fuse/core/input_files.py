@@ -76,7 +76,7 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder is a file or contains an input, also by a link.
+    """Raise an OutputError if the output folder is a file, or contains an input or a link to one.
 
     Files in the folder and in its subfolders are checked, because outputs are written to both.
     """

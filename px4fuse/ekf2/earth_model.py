@@ -25,7 +25,7 @@ def earth_rate_rad_s(record: FusionRecord) -> Array:
 
 
 def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
-    """Return the ratio of EKF2's internal metres to published metres along north, east and down."""
+    """Return the scale of EKF2's internal position relative to the published one, for each axis."""
     if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2

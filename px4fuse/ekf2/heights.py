@@ -257,7 +257,7 @@ class HeightFilter:
         return x, P
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
-        """Update the flag of a bad acceleration after all fusions of one event."""
+        """Update EKF2's flag for a bad vertical acceleration after the samples of one time."""
         update_log = self.update_log[max(e - 1, 0) : e + 1]
         ratios = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
         if (ratios > MIN_LARGER_RATIO).any():

@@ -63,8 +63,7 @@ MIN_SEGMENT_S = 10.0
 MAX_RESET_DELAY_S = 0.5
 # Maximum fraction of clipped IMU samples within 1 s: with more, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
-# Maximum fraction of IMU samples that the log lacks outside gaps, for ignoring the missing samples
-# in prediction steps
+# Maximum fraction of single IMU samples missing in the log, up to which the replay ignores them
 MAX_LOST_IMU_SHARE = 0.02
 
 # Gravity in NED (CONSTANTS_ONE_G in PX4)

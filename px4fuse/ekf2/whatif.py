@@ -474,7 +474,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
 
 
 def _mean_rejected(samples: pd.DataFrame, column: str, evaluated_s: Spans) -> float | None:
-    """Return the mean of a column over the evaluated times; None without samples."""
+    """Return the fraction of rejected samples in the evaluated times; None without samples."""
     is_rejected = samples.loc[inside_spans(samples.index, evaluated_s)].get(column)
     return None if is_rejected is None or is_rejected.empty else float(is_rejected.mean())
 

@@ -92,7 +92,7 @@ class HiddenMistake(Record, frozen=True):
 
 
 class MistakeTable(Record, frozen=True):
-    """Possible answers with their texts, and faults of practice flights (``practice.toml``)."""
+    """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
@@ -127,7 +127,7 @@ class PracticeFlight:
 
 
 def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
-    """Draw random flights in which all right answers occur equally often.
+    """Draw random practice flights; each injected fault is the right answer equally often.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from scipy.linalg import lapack
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) of the smooth path that is subtracted from the positions
+# SIGMA_A (m/s²) and SIGMA_Z (m) of the KF whose smoothed path is subtracted from the positions
 PATH_NOISES = 0.5, 0.1
 # Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3

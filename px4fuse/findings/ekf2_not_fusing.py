@@ -25,8 +25,8 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
 from px4fuse.flight.position_source import POSITION_FILE
 
-# Minimum fraction of the analysed time with fusion of the source for a severity below error: with
-# less fusion, EKF2 uses other sensors most of the time
+# Minimum fraction of the time in which EKF2 fuses the source. Below it the severity is error,
+# because EKF2 uses other sensors most of the time
 MIN_FUSING_SHARE_ERROR = 0.5
 # Minimum fraction of the analysed time with fusion of the source without a finding: 2 % of a minute
 # are about 1 s

@@ -117,7 +117,7 @@ def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
 
 
 def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
-    """Make the finding of a source that begins or stops in flight."""
+    """Report a source that begins or stops in flight."""
     (start_s, end_s), source = span_s, analysis.source
     stops = end_s == analysis.segment.flight.end_s
     event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")

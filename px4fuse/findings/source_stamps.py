@@ -74,7 +74,7 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
 
 
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
-    """Make the finding of timestamps in a wrong unit or from another clock."""
+    """Report timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     effect = ""

@@ -227,7 +227,10 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a cell up to the last non-empty one; True stands for value = text."""
+    """Return the fields of a table cell without empty fields at the end.
+
+    A value that equals the text of the cell is replaced by True.
+    """
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     fields = [cell.text, value, cell.below, cell.style_class]
     while fields and fields[-1] == "":

@@ -32,7 +32,7 @@ ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
 LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
 TIME_HEIGHT = 105.0  # height (points) of the axes of the difference over time
-# Style of the bar of a replacement that increases KF - EKF2
+# Style of the bar of a replaced setting that increases the difference KF - EKF2
 INCREASE_STYLE = {"color": "white", "hatch": "////"}
 
 
@@ -81,7 +81,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 
 def unexplained_note(analysis: Analysis) -> str:
-    """Return the reason for a missing explanation of KF - EKF2; "" if nothing is missing."""
+    """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
     explanations = list(_axis_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations

@@ -95,7 +95,7 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = student_line(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
-    # figures need no further fonts, because they contain no names or notes
+    # fonts for other scripts are not needed in figures: figures contain no names and no notes
     all_text = title + name + student + written_text
     return compile_pdf(
         {

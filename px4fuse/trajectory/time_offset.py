@@ -168,7 +168,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
             f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
-    # The fit is repeated with all poses that overlap at offsets near the first result
+    # The fit is repeated with more poses: all that overlap in time near the first estimated offset
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_WINDOW_S)
         or best_fit

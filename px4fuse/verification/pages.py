@@ -258,7 +258,10 @@ class _PdfComparison:
         page: int,
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield different keys and streams of PDF dictionaries; append values to compare later."""
+        """Yield keys and streams that differ between two PDF dictionaries.
+
+        Values to compare later are appended to ``remaining_values``.
+        """
         submitted_keys, redrawn_keys = (
             _compared_keys(submitted_dictionary, key),
             _compared_keys(redrawn_dictionary, key),

@@ -462,7 +462,7 @@ def match_overrides(
 
 
 def parse_late_rule(text: str) -> LateRule:
-    """Parse a late rule such as ``10%/day`` or ``10%/day up to 50%``.
+    """Parse a rule for late submissions such as ``10%/day`` or ``10%/day up to 50%``.
 
     Raises
     ------
