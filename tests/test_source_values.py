@@ -91,6 +91,10 @@ def test_rounding_step_of_float32_positions_is_found(origin, step):
     assert rounding_step(values) < 0.01
 
 
+def test_rounding_step_with_denormal_difference_is_zero():
+    assert rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
+
+
 @pytest.mark.parametrize(("stamp", "clock"), [
     (lambda us: us // 1000, "milliseconds"),
     (lambda us: us // 1_000_000, "seconds"),

@@ -119,8 +119,9 @@ def rounding_step(values: Array) -> float:
     steps = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(steps):
         return 0.0
-    multiples = steps / steps.min()
-    is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_MULTIPLE_ERROR
+    with np.errstate(over="ignore", invalid="ignore"):  # a tiny step makes the ratio infinite
+        multiples = steps / steps.min()
+        is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_MULTIPLE_ERROR
     return float(steps.min()) if is_multiple.all() else 0.0
 
 
