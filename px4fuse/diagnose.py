@@ -96,7 +96,7 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
         convention = structs.replace(convention, late_s=-clock.offset_s)
         comparison = replace(comparison, convention=convention)
     reruns = intervene(comparison, estimates, progress)
-    progress("searching for a loop closure")
+    progress("measuring the loop closure error")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight

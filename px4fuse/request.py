@@ -272,7 +272,7 @@ _POSITION_OPTIONS = {
 def _option_names(
     kind: type[msgspec.Struct], excluded: Sequence[str] = (), **exceptions: str
 ) -> dict[str, str]:
-    """Return the command line options of the optional fields of a request.
+    """Return the command line option of each optional field of a request, by field name.
 
     An option is the field name with hyphens and without unit, except for ``exceptions``.
     """

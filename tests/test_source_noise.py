@@ -252,7 +252,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
-def test_time_correlation_fit_tests_zero_and_estimated_offset(
+def test_time_correlation_fit_tries_zero_and_estimated_time_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

@@ -31,7 +31,8 @@ GAP = "gap"
 # Key in Finding.evidence of findings about axes, unit, clock or orientation of the source, which
 # precede all other findings
 CONVENTION = "convention"
-# Findings that precede all others, because no estimate from these positions or this IMU is valid.
+# Findings that are listed before all others: they make all estimates from the IMU or the positions
+# invalid
 WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
 UNUSABLE = (
     *WRONG_IMU,

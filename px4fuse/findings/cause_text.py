@@ -24,7 +24,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
-def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
+def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
     """Return the kind of cause that a re-run shows; ELSEWHERE without a re-run."""
     if cause is None:
         return kinds.ELSEWHERE

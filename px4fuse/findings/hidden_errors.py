@@ -26,7 +26,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
-from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
+from px4fuse.findings.cause_text import format_action, is_refuted, kind_of_cause
 from px4fuse.findings.model import Findings, error, finding, format_percent, note
 from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
@@ -136,7 +136,7 @@ def make_error_finding(
                 f"{format_metres(excess.reported_sigma_m)} m."
             )
     cause = causes.get(worst_filter) or next(iter(causes.values()), None)
-    evidence |= {CAUSE: classify_cause(analysis, cause)}
+    evidence |= {CAUSE: kind_of_cause(analysis, cause)}
     aligned = None if causes else _rmse_after_alignment(analysis, worst_filter)
     if aligned is not None:
         evidence |= {

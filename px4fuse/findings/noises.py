@@ -33,10 +33,10 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
-    classify_cause,
     format_action,
     format_kf_settings,
     is_refuted,
+    kind_of_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, lower_severity
@@ -324,7 +324,7 @@ def _variance_finding(
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
         rerun = find_cause(analysis.trials, filter_name, result.axis.name)
-        cause = classify_cause(analysis, rerun)
+        cause = kind_of_cause(analysis, rerun)
         remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
     evidence: dict[str, float | str] = {

@@ -323,7 +323,7 @@ def _analysis_options(
         imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
-    yield from _comparison_options(flight, comparison)
+    yield from _analyses_against_ekf2_and_truth(flight, comparison)
     aids, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
         rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
@@ -346,7 +346,9 @@ def _analysis_option(name: str, part: object, description: str) -> AnalysisOptio
     return AnalysisOption(name, True, description)
 
 
-def _comparison_options(flight: Flight, comparison: Comparison | None) -> Iterator[AnalysisOption]:
+def _analyses_against_ekf2_and_truth(
+    flight: Flight, comparison: Comparison | None
+) -> Iterator[AnalysisOption]:
     """Yield the analyses that compare KF with EKF2 and with ground truth."""
     parts: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     parts["error"] = flight.truth

@@ -90,7 +90,7 @@ class PositionRecording:
     frames : tuple of str
         Frames that column names or format allow, such as ("ned",); empty if they contain none.
     detected : tuple of str
-        One sentence per detected property of the format.
+        Sentences about the detected format: one for each property, such as unit or frame.
     notes : tuple of str
         Number of dropped rows with the reason, and warnings.
     dropped : int

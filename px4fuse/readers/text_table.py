@@ -88,18 +88,20 @@ class Rows:
         if len(invalid_indices):
             raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
 
-    def parse(self, words: int, values: int) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Parse rows of word columns followed by number columns, separated by white space.
+    def parse(
+        self, text_count: int, number_count: int
+    ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
+        """Parse rows of text columns followed by number columns, separated by white space.
 
         Parameters
         ----------
-        words, values : int
-            Number of word columns and of number columns.
+        text_count, number_count : int
+            Numbers of text columns and of number columns.
 
         Returns
         -------
-        words : ndarray of str, shape (n, words)
-        values : ndarray, shape (n, values)
+        texts : ndarray of str, shape (n, text_count)
+        numbers : ndarray, shape (n, number_count)
 
         Raises
         ------
@@ -107,21 +109,21 @@ class Rows:
             A row has another number of columns, or no number in a number column. The message
             contains the first such line.
         """
-        texts = [text for _, text in self.lines]
-        columns = [("words", "U80", (words,)), ("values", "f8", (values,))]
+        lines = [text for _, text in self.lines]
+        columns = [("texts", "U80", (text_count,)), ("numbers", "f8", (number_count,))]
         try:
-            table = np.loadtxt(texts, dtype=columns, ndmin=1)
+            table = np.loadtxt(lines, dtype=columns, ndmin=1)
         except ValueError as error:
-            row_fields = (text.split() for text in texts)
+            row_fields = (text.split() for text in lines)
             is_valid = (
-                len(fields) == words + values
-                and all(is_number(field_text.strip()) for field_text in fields[words:])
+                len(fields) == text_count + number_count
+                and all(is_number(field_text.strip()) for field_text in fields[text_count:])
                 for fields in row_fields
             )
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             raise self.row_error(
                 row,
-                f"{quote(texts[row])} does not have {words + values} columns of numbers",
+                f"{quote(lines[row])} does not have {text_count + number_count} columns of numbers",
                 "Correct or remove this line.",
             ) from error
-        return table["words"], np.ascontiguousarray(table["values"])
+        return table["texts"], np.ascontiguousarray(table["numbers"])

@@ -307,7 +307,8 @@ class _OffsetFit:
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
     """Compute the half-width (s) of the 95 % interval.
 
-    It is infinite if a change of position, rotation or scale has the same effect as a time offset.
+    The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
+    same effect as a time offset.
     """
     n = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
