@@ -93,7 +93,12 @@ TARGETS: Mapping[str, Target] = {
     "logging": "logging",
 }
 # Device or filter to be changed, by id of the finding, if it differs from TARGETS of its group
-TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
+TARGETS_BY_ID: Mapping[str, Target] = {
+    "source_drift": "source",
+    "source_lever_arm": "EKF2",
+    "source_height_only": "EKF2",
+    "ekf2_not_fusing": "sender",
+}
 
 
 class RankedCause(NamedTuple):

@@ -16,6 +16,7 @@ from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
+    HEIGHT_ONLY,
     Columns,
     Ekf2,
     Flight,
@@ -275,6 +276,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damaged}no external position in this log (no {topics})"
+    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
+    if height_only is not None:
+        reason = f"{damaged}{height_only.source}: {HEIGHT_ONLY}"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"

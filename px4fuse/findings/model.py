@@ -11,6 +11,8 @@ import pandas as pd
 from px4fuse.core.record import Record, Span, table
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
+from px4fuse.flight.model import PositionTrack
+from px4fuse.flight.position_source import PositionKind
 
 
 class CatalogueEntry(Record, frozen=True):
@@ -55,6 +57,32 @@ def load_examples() -> Mapping[str, Example]:
     return msgspec.json.decode(
         Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
     )
+
+
+class SourceWords(Record, frozen=True):
+    """Causes and actions of findings about the position source, for one kind of source."""
+
+    smoothing_action: str
+    jump: str
+    jump_action: str
+    outliers: str
+    outliers_action: str
+    reception: str
+    noise: str
+    slow_errors_action: str
+    unequal_axes_action: str
+    scale: str
+    errors_action: str
+
+
+SOURCE_WORDS: Mapping[PositionKind, SourceWords] = table(
+    __file__, "source_words.toml", dict[PositionKind, SourceWords]
+)
+
+
+def source_words(source: PositionTrack) -> SourceWords:
+    """Return the words of findings about a position source, which fit its kind of sensor."""
+    return SOURCE_WORDS[source.origin.kind]
 
 
 Findings = Iterator[Finding]

@@ -435,8 +435,8 @@ def _remedy_without_replay(
             "change: fly again and compare."
         )
     return (
-        f"EKF2's measurement noise ({ekf2_m:.2g} m) is right: check {aid.delay} and "
-        "EKF2_ACC_NOISE instead."
+        f"EKF2's measurement noise ({ekf2_m:.2g} m) fits the position noise, so another error "
+        "makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
     )
 
 

@@ -21,11 +21,10 @@ from px4fuse.convention.texts import (
 )
 from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE, WRONG_IMU
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
-CORRECT_FIRST = "Correct the {} first."
 # Findings that are false if the source is wrong: they concern EKF2's parameters or the alignment
 FALSE_AFTER = (
     "ekf2_noise_too_small",
@@ -38,7 +37,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Ids of findings that remain true if the source's convention is wrong, with CORRECT_FIRST as action
+# Ids of findings that remain true if the source's convention is wrong, as effects of it
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -89,10 +88,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             for item in findings
             if item in unusable
             or item.id in EFFECTS
-            or (
-                CATALOGUE[item.id].group in UNAFFECTED_GROUPS
-                and (item.id != "accelerometer_bias" or unusable[0].id not in WRONG_IMU)
-            )
+            or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         roots = []
@@ -102,9 +98,8 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     others = [item for item in findings if item not in roots and item.id not in FALSE_AFTER]
     if faults.is_ambiguous and not unusable:
         return [*roots, *(item for item in others if item.id in EFFECTS or item.severity == "note")]
-    action = CORRECT_FIRST.format("IMU" if roots[0].id in WRONG_IMU else "position source")
     effects = [
-        replace(item, message=f"{item.title}.", remedy=action, caused_by=roots[0].id)
+        replace(item, message=f"{item.title}.", caused_by=roots[0].id)
         for item in others
         if item.id in EFFECTS and item.caused_by is None
     ]

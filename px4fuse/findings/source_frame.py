@@ -10,7 +10,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
@@ -32,9 +32,9 @@ LARGE_HEADING_ERROR_DEG = 15.0
 MIN_TRUE_DRIFT_SHARE = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
-# EKF2_MAG_TYPE without magnetometer
-NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
+# Bit of EKF2_EV_CTRL that fuses the yaw of the source
+YAW_CONTROL = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
@@ -157,13 +157,18 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     basis = "positions and IMU"
     if heading.by == "orientation":
         basis = f"the orientation of {source_name(analysis.source)}"
-    possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+    calibrate, has_yaw = _calibrate(analysis), analysis.source.orientation is not None
+    causes = [
+        "a magnetometer indoors" if calibrate else "a gyroscope bias",
+        *(["odometry whose heading drifts"] if has_yaw else []),
+    ]
+    possible_cause, action = ", or ".join(causes), ""
+    is_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL
+    if has_yaw and not is_fused:
+        action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
-    elif analysis.source.orientation is None:
-        action = ""  # the source has no yaw that EKF2 could fuse
-    elif not analysis.flight.log.has_ulog:
+    elif action and not analysis.flight.log.has_ulog:
         action = "Or let the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
@@ -174,7 +179,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
         f"{possible_cause}.",
-        f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
+        capitalise_first(f"{calibrate} {action}".strip().removeprefix("Or "))
+        or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,

@@ -14,7 +14,7 @@ from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Findings, error, format_percent, note, warning
+from px4fuse.findings.model import Findings, error, format_percent, note, source_words, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
@@ -70,9 +70,6 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     ratio = noise.white_m / float(np.nanmin(assumed_m))
     if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_SHARE * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
-    action = "Check multipath, anchor geometry and smoothing in the positioning system."
-    if is_gnss:
-        action = "Use RTK, or give the antenna a free view of the sky."
     # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
     make_finding = note if is_gnss and not _exceeds_sigma(analysis) else warning
     yield make_finding(
@@ -81,7 +78,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
         "KF and EKF2 assume independent errors: they follow the correlated error and report a σ "
         "that is too small. Innovations do not show this error.",
-        action,
+        source_words(analysis.source).slow_errors_action,
         evidence,
     )
 
@@ -141,7 +138,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         f"{capitalise_first(source_name(analysis.source))} noise is {large:.2g} m along "
         f"{noisier_axis} and {small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 "
         "measurement noise, does not fit both axes.",
-        "Place the anchors on all sides of the flight area. Analyse each axis separately "
+        f"{source_words(analysis.source).unequal_axes_action} Analyse each axis separately "
         f"(--axis {noisier_axis} --sigma-z {large:.2g}).",
         {f"{quieter_axis}_sigma_z_m": small, f"{noisier_axis}_sigma_z_m": large},
     )
@@ -156,16 +153,13 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if part.ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS:
         return
     ratio, start, end = part.ratio, part.start_s, part.end_s
-    check = "anchors in view, distance and obstacles"
-    if analysis.source.origin.is_gnss:
-        check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
         "source_noise_varies",
         f"{capitalise_first(source_name(analysis.source))} noise is {ratio:.1f} times larger from "
         f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
         "No single SIGMA_Z fits the whole flight.",
-        f"Check {check} in that time. Let the source send a variance with each position, or "
-        "analyse this time separately (--start, --end).",
+        f"Check {source_words(analysis.source).noise} in that time. Let the source send a variance "
+        "with each position, or analyse this time separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

@@ -5,7 +5,7 @@ error of 5 % is not detected. With 10 Hz and 0.05 m, 15 % is detected. Smaller e
 measured distance or ground truth.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -30,6 +30,7 @@ from px4fuse.findings.model import (
     finding,
     format_count,
     format_percent,
+    source_words,
     warning,
     zero_length_spans,
 )
@@ -42,15 +43,13 @@ from px4fuse.flight.model import (
     positions_of,
     reset_times_s,
     source_name,
+    white_noise_m,
 )
-from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
 MIN_MOTION_RANGE_M = 0.5
 # Extent of white noise in σ (5th to 95th percentile), with a margin of 25 %
 NOISE_RANGE_FACTOR = 1.25 * 3.29
-# Ratio of the median absolute second difference to the σ of white noise
-SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
 # Minimum gain of the log likelihood by a low pass: flights without a low pass have 0 to 2
 MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum log likelihood of a low pass relative to time-correlated noise without lag
@@ -63,16 +62,30 @@ MIN_LAG_ERROR_S = 0.10
 MIN_JUMP_M = 0.2
 # Minimum jump in σ of the time-correlated noise, which changes by up to √2 σ
 MIN_JUMP_SIGMAS = 5.0
-# Minimum number of announced jumps of a source that relocalises
-MIN_RELOCALISATIONS = 2
+# Minimum number of jumps of a source that jumps repeatedly, with a change of reset_counter
+MIN_ANNOUNCED_JUMPS = 2
+# Minimum number of jumps of a source that jumps repeatedly, without a change of reset_counter
+MIN_UNANNOUNCED_JUMPS = 3
+# Minimum size (m) of one of many jumps without a change of reset_counter
+MIN_SMALL_JUMP_M = 0.1
+# Minimum size of such a jump in medians of the differences of successive steps
+MIN_STEP_RATIO = 12.0
+# Minimum number of steps between positions to find jumps
+MIN_JUMP_ROWS = 100
+# Maximum ratio of a difference beside a jump to that at the jump
+MAX_BESIDE_RATIO = 0.75
+# Maximum interval at a jump in median intervals: during a gap the vehicle moves
+MAX_INTERVAL_RATIO = 1.5
+# Minimum fraction of jumps opposite to the previous one, for positions that alternate
+MIN_RETURNS = 0.7
 # Maximum time (s) from a jump to the reset of EKF2 that it causes
 MAX_WAIT_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Tolerance (s) for equal times: timestamps have a resolution of 1 µs
 RESET_TOLERANCE_S = 1e-4
-# EKF2_EV_CTRL of a source that measures the height only
-HEIGHT_ONLY_CONTROL = 2
+# Bits of EKF2_EV_CTRL: horizontal position, and height
+HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
 # Maximum time (s) between a jump and its reset_counter: two intervals at 2 Hz
 MAX_RESET_DISTANCE_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
@@ -95,46 +108,6 @@ MIN_INNOVATION_SHARE = 0.75
 MIN_VARIANCE_RATIO = 2.0
 # Minimum ratio of reported and estimated position variance, or its inverse, for severity error
 MIN_VARIANCE_RATIO_ERROR = 3.0
-# Possible causes of a position jump, and action, by kind of source
-JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
-    "uwb": (
-        "a change of the anchors or of the origin",
-        "Do not change origin or anchors in flight.",
-    ),
-    "vio": (
-        "a false map match, or relocalisation in the map",
-        "Do not change map or origin in flight.",
-    ),
-    "mocap": (
-        ("confused markers, or a change of the origin"),
-        "Do not change origin or rigid body in flight.",
-    ),
-    "gnss": (
-        "a change of satellites or RTK status, or multipath",
-        "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered.",
-    ),
-    "file": ("a false map match, or a change of the origin", "Use one origin for the whole file."),
-}
-# Possible cause of outliers, and action, by kind of source
-OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
-    "uwb": (
-        "reflections without line of sight (NLOS)",
-        "Give the tag line of sight to the anchors, or remove outliers before sending.",
-    ),
-    "vio": (
-        "lost visual tracking",
-        "Check light and texture in view of the camera, or remove outliers before sending.",
-    ),
-    "mocap": (
-        "hidden or confused markers",
-        "Check the markers in view of the cameras, or remove outliers before sending.",
-    ),
-    "gnss": (
-        "multipath, or a change of the GNSS solution (fix type)",
-        "Keep the antenna in free view of the sky, away from walls and interference.",
-    ),
-    "file": ("lost or ambiguous tracking", "Remove the outliers from the file."),
-}
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -143,7 +116,7 @@ def detect(analysis: Analysis) -> Findings:
         yield make_height_only_finding(analysis)
         return
     yield from detect_little_motion(analysis)
-    yield from detect_relocalisation(analysis)
+    yield from detect_repeated_jumps(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
@@ -189,8 +162,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
             f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
             f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
             "independent errors, so both are overconfident and lag.",
-            "Switch off smoothing in the positioning system and send raw positions. Leave the "
-            "timestamps as they are.",
+            f"{source_words(analysis.source).smoothing_action} Leave the timestamps as they are.",
             asdict(low_pass),
         )
 
@@ -212,8 +184,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
         positions = capitalise_first(positions_of(analysis.source))
-        causes, action = JUMP_CAUSES[analysis.source.origin.kind]
-        cause = f"Possible causes: {causes}."
+        words = source_words(analysis.source)
+        cause = f"Possible causes: {words.jump}."
         evidence = {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
         if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
@@ -233,7 +205,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
             f"{positions} jump {extent} at {at_s:.1f} s and {end}. The IMU measures no such "
             f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} After the jump the positions of KF "
             "and EKF2 are wrong by its size, with consistent innovations.",
-            f"{action} Analyse only the time before or after the jump (--start, --end).",
+            f"{words.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
@@ -243,9 +215,14 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
     """Make the finding of a source with constant x and y."""
     source, log = analysis.source, analysis.flight.log
     x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
-    parameter, action = EV_POS.switch, "Action: none, if the source measures only the height."
-    if int(log.parameters.get(parameter, 0.0)) == HEIGHT_ONLY_CONTROL:
-        action = f"Leave {parameter} at {HEIGHT_ONLY_CONTROL} (height only): it is correct."
+    parameter = EV_POS.switch
+    control = int(log.parameters.get(parameter, HEIGHT_ONLY_CONTROL))
+    action = f"Leave {parameter} at {control} (no horizontal position): it is correct."
+    if control & HORIZONTAL_CONTROL:
+        action = (
+            f"Set {parameter} to {control & ~HORIZONTAL_CONTROL | HEIGHT_ONLY_CONTROL} (height "
+            "only): now EKF2 fuses the constant x and y."
+        )
     return warning(
         "source_height_only",
         f"x and y of {source.name} are constant ({x_m:g}, {y_m:g} m) in the whole flight. Only the "
@@ -255,23 +232,18 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
     )
 
 
-def detect_relocalisation(analysis: Analysis) -> Findings:
-    """Detect a source that drifts and jumps back, each time with a rise of its reset_counter."""
-    source, segment, ekf2 = analysis.source, analysis.segment, analysis.flight.ekf2
-    position_m = source.samples[Columns.POSITION[:2]].dropna()
-    time_s, jumps = position_m.index.to_numpy(), []
-    steps_m = np.diff(position_m.to_numpy(), axis=0)
-    for reset_s in reset_times_s(source):
-        row = int(np.searchsorted(time_s, reset_s - RESET_TOLERANCE_S)) - 1
-        if not (segment.start_s < reset_s < segment.end_s and 0 < row < len(steps_m) - 1):
-            continue
-        motion_m = 0.5 * (steps_m[row - 1] + steps_m[row + 1])
-        size_m = float(np.linalg.norm(steps_m[row] - motion_m))
-        if size_m >= MIN_JUMP_M:
-            jumps.append((float(reset_s), size_m))
-    if len(jumps) < MIN_RELOCALISATIONS:
+def detect_repeated_jumps(analysis: Analysis) -> Findings:
+    """Detect a source that jumps again and again: it corrects its drift, or measures two points."""
+    ekf2, reset_s = analysis.flight.ekf2, reset_times_s(analysis.source)
+    jumps = _announced_jumps(analysis, reset_s)
+    if is_announced := len(jumps) >= MIN_ANNOUNCED_JUMPS:
+        counter = "its reset_counter rises at each jump"
+    elif len(jumps := _unannounced_jumps(analysis)) >= MIN_UNANNOUNCED_JUMPS:
+        counter = "its reset_counter does not announce the jumps"
+    else:
         return
-    times_s, sizes_m = np.transpose(jumps)
+    times_s, steps_m = np.array([time_s for time_s, _ in jumps]), np.array([s for _, s in jumps])
+    sizes_m = np.linalg.norm(steps_m, axis=1)
     resets_s = [
         reset.time_s
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
@@ -289,17 +261,59 @@ def detect_relocalisation(analysis: Analysis) -> Findings:
             f"{np.median(waits_s):.1f} s later."
         )
     listed = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
+    returns = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    cause = "the source (VIO or SLAM) drifts and corrects its drift"
+    if not is_announced:
+        cause = f"possible causes are {source_words(analysis.source).jump}"
+    action = "Improve the tracking of the source, or correct the drift in smaller steps."
+    if returns.mean() >= MIN_RETURNS:
+        cause = f"the source measures two points in turn, {np.median(sizes_m):.2f} m apart"
+        action = "Send the position of one point of the vehicle."
     yield error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and its "
-        f"reset_counter rises at each jump. The jumps are at {listed} s, every "
-        f"{np.median(np.diff(times_s)):.0f} s: the source (VIO or SLAM) drifts and corrects its "
-        f"drift.{effect}",
-        "Improve the tracking of the source (light, texture, calibration of the camera), or "
-        "correct the drift in smaller steps. Analyse the time between two jumps (--start, --end).",
-        {"count": len(jumps), "largest_m": float(sizes_m.max())},
+        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and {counter}. The "
+        f"jumps are at {listed} s, every {np.median(np.diff(times_s)):.0f} s: {cause}.{effect}",
+        f"{action} Analyse the time between two jumps (--start, --end).",
+        {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
         zero_length_spans(times_s.tolist()),
     )
+
+
+def _announced_jumps(analysis: Analysis, reset_s: Array) -> list[tuple[float, Array]]:
+    """Return time (s) and step (m) of the jumps at which ``reset_counter`` changes."""
+    position_m = analysis.source.samples[Columns.POSITION[:2]].dropna()
+    time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
+    jumps = []
+    for at_s in reset_s:
+        row = int(np.searchsorted(time_s, at_s - RESET_TOLERANCE_S)) - 1
+        inside = analysis.segment.start_s < at_s < analysis.segment.end_s
+        if inside and 0 < row < len(steps_m) - 1:
+            step_m = steps_m[row] - 0.5 * (steps_m[row - 1] + steps_m[row + 1])
+            if np.linalg.norm(step_m) >= MIN_JUMP_M:
+                jumps.append((float(at_s), step_m))
+    return jumps
+
+
+def _unannounced_jumps(analysis: Analysis) -> list[tuple[float, Array]]:
+    """Return time (s) and step (m) of lasting jumps that are far above the noise."""
+    position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
+        Columns.POSITION[:2]
+    ].dropna()
+    time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
+    if len(steps_m) < MIN_JUMP_ROWS:
+        return []
+    excess_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
+    size_m = np.linalg.norm(excess_m, axis=1)
+    interval_s = np.diff(time_s)[1:-1]
+    limit_m = max(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * float(np.median(size_m)))
+    # the steps beside a jump differ by half its size, those of a single outlier by more
+    beside_m = np.maximum(np.roll(size_m, 1), np.roll(size_m, -1))
+    is_jump = (size_m > limit_m) & (beside_m < MAX_BESIDE_RATIO * size_m)
+    is_jump &= interval_s < MAX_INTERVAL_RATIO * np.median(interval_s)
+    rows = np.flatnonzero(is_jump)
+    lasts = np.diff(time_s[rows], prepend=-np.inf, append=np.inf)
+    rows = rows[(lasts[:-1] > OUTLIER_BURST_S) & (lasts[1:] > OUTLIER_BURST_S)]
+    return [(float(time_s[row + 2]), excess_m[row]) for row in rows]
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
@@ -324,8 +338,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
             f"comparison is with the IMU (± {format_percent(1.96 * sigma)}, 95 %). Innovations do "
             "not show a scale factor error.",
-            "Measure a known distance with the source. Then survey the anchors again, and check "
-            "unit and calibration.",
+            f"Measure a known distance with the source. {source_words(analysis.source).scale}.",
             {"scale": 1.0 + excess, "sigma": sigma},
         )
 
@@ -348,7 +361,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     count, share = len(times_s), len(times_s) / axis_tuning.count
     if share < MIN_OUTLIER_SHARE or count < MIN_OUTLIERS:
         return
-    possible_cause, action = OUTLIER_CAUSES[analysis.source.origin.kind]
+    words = source_words(analysis.source)
     sizes_m, reference = outlier_sizes_m(analysis, np.array(times_s))
     yield finding(
         "error" if share >= MIN_OUTLIER_SHARE_ERROR else "warning",
@@ -356,9 +369,9 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. The outliers ({format_percent(share, 1)}) have "
         f"a median distance of {format_metres(float(np.median(sizes_m)))} m to {reference}. "
-        f"Possible cause: {possible_cause}. KF has no gate and follows each "
+        f"Possible cause: {words.outliers}. KF has no gate and follows each "
         f"outlier.{_rejected(analysis, times_s)}",
-        action,
+        words.outliers_action,
         {"count": count, "share": share, "first_s": times_s[0], "max_m": float(sizes_m.max())},
         zero_length_spans(times_s),
     )
@@ -462,15 +475,11 @@ def motion_range_m(comparison: Comparison) -> float:
 
 
 def hardly_moved(comparison: Comparison) -> bool:
-    """Return True if the extent of the positions is small, or explained by noise.
-
-    The noise is estimated from second differences, which are zero at constant velocity.
-    """
+    """Return True if the extent of the positions is small, or explained by noise."""
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    second_difference_m = np.median(np.abs(np.diff(positions.to_numpy(), 2, axis=0)), axis=0)
-    noise_m = float(second_difference_m.max()) / SECOND_DIFFERENCE_FACTOR
+    noise_m = white_noise_m(positions.to_numpy())
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)
 
 

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from px4fuse.core.record import Record
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
-PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
+PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 DataPath = Literal[
     "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
 ]
@@ -19,7 +19,9 @@ class Origin(Record, frozen=True):
     Attributes
     ----------
     kind : str
-        "uwb" is any positioning system without orientation, "vio" is any odometry.
+        "uwb" is a noisy source without orientation, "unknown" a precise or fast one (see
+        :func:`px4fuse.flight.model.kind_without_orientation`), "vio" is any source with a changing
+        orientation.
     path : str
         Data path from the sender to the log.
     aid : Aid or None
