@@ -1,8 +1,7 @@
 """Correlation of two series with gaps at all lags, and autocovariance of a series."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import fft
@@ -77,8 +76,8 @@ def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """
     size = len(a) + len(b) - 1
     is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)
-    transform: Callable[..., Complex] = fft.fft if is_complex else fft.rfft
-    inverse: Callable[..., Complex] = fft.ifft if is_complex else fft.irfft
+    transform: Any = fft.fft if is_complex else fft.rfft
+    inverse: Any = fft.ifft if is_complex else fft.irfft
     padded_size = fft.next_fast_len(size, not is_complex)
     spectrum = transform(a, padded_size) * transform(np.conj(b[::-1]), padded_size)
     return np.asarray(inverse(spectrum, padded_size)[:size])
