@@ -82,16 +82,6 @@ class Estimates:
     noisy_part: NoisyPart | None = None
 
 
-WITHHELD_ESTIMATES = Estimates(
-    tuning={HORIZONTAL: WITHHELD},
-    clock=WITHHELD,
-    heading=WITHHELD,
-    bias_scale_jump_fit=WITHHELD,
-    source_low_pass=WITHHELD,
-    time_correlated_noise=WITHHELD,
-)
-
-
 def ignore_progress(_: str) -> None:
     """Ignore the progress text."""
 
@@ -109,8 +99,6 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and errors of the source."""
-    if comparison.flight.log.is_assessed:
-        return WITHHELD_ESTIMATES
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -147,7 +135,7 @@ def tuned(
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
     if flight.log.is_assessed:
-        return dict(WITHHELD_ESTIMATES.tuning)
+        return {HORIZONTAL: WITHHELD}
     return tune(
         comparison.lines,
         comparison.settings,

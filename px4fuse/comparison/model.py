@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import pandas as pd
 from msgspec import structs
@@ -10,8 +10,10 @@ from msgspec import structs
 from px4fuse.convention.model import Convention
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import (
+    NOT_WRITTEN,
     Count,
     NotNegative,
+    NotWritten,
     OrUnavailable,
     Positive,
     Record,
@@ -28,6 +30,7 @@ from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight.model import Flight, PositionTrack
 
 FilterName = Literal["kf", "ekf2"]
+Track: TypeAlias = pd.DataFrame | Unavailable
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
@@ -103,8 +106,8 @@ class Updates(Record, frozen=True, kw_only=True):
     input_gap_s: NotNegative
 
 
-class AxisResult(Record, frozen=True, kw_only=True):
-    """Result of the comparison along one axis.
+class AxisComparison(Record, frozen=True, kw_only=True):
+    """Result of the comparison along one axis, with the KF run and the tracks.
 
     Attributes
     ----------
@@ -116,22 +119,6 @@ class AxisResult(Record, frozen=True, kw_only=True):
         Origin of the axis direction, for the user.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
-    """
-
-    heading_deg: float | None = None
-    direction: Vector
-    note: str
-    updates: Updates
-    filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
-    difference: OrUnavailable[Difference]
-    rejected_fraction: Share | None = None
-
-
-class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
-    """Result of the comparison along one axis, with the KF run and the tracks.
-
-    Attributes
-    ----------
     ekf2_state : DataFrame or Unavailable
         Position and velocity, without resets that move the origin of EKF2's frame.
     ekf2_innovations : DataFrame or Unavailable
@@ -141,16 +128,20 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
         State, variance and ground truth of the whole flight; the attributes contain the segment.
     """
 
-    schema_type = AxisResult
-    axis: Axis
-    replay: Replay
-    ekf2_state: pd.DataFrame | Unavailable
-    ekf2_variance: pd.DataFrame | Unavailable
-    ekf2_innovations: pd.DataFrame | Unavailable
-    truth: pd.DataFrame | Unavailable
-    flight_tracks: Mapping[str, pd.DataFrame | Unavailable]
-
-    __repr__ = one_line_repr
+    heading_deg: float | None = None
+    direction: Vector
+    note: str
+    updates: Updates
+    filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
+    difference: OrUnavailable[Difference]
+    rejected_fraction: Share | None = None
+    axis: NotWritten[Axis] = NOT_WRITTEN
+    replay: NotWritten[Replay] = NOT_WRITTEN
+    ekf2_state: NotWritten[Track] = NOT_WRITTEN
+    ekf2_variance: NotWritten[Track] = NOT_WRITTEN
+    ekf2_innovations: NotWritten[Track] = NOT_WRITTEN
+    truth: NotWritten[Track] = NOT_WRITTEN
+    flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
 
     @property
     def in_flight(self) -> "AxisComparison":

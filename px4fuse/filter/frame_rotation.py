@@ -18,7 +18,6 @@ from msgspec import structs
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, median_interval
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -100,8 +99,6 @@ class HeadingError(Record, frozen=True):
     parts: tuple[HeadingPart, ...]
     drift_p: Share
     by: Literal["orientation", "positions"]
-
-    __repr__ = one_line_repr
 
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:

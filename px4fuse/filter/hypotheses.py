@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -118,8 +117,6 @@ class BiasScaleJumpFit:
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
-
-    __repr__ = one_line_repr
 
     @property
     def bias(self) -> Estimate:

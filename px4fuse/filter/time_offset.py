@@ -18,8 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Share, Span
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
 from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
@@ -70,7 +69,7 @@ class PartOffset(Record, frozen=True):
     sigma_s: NotNegative
 
 
-class Clock(Record, frozen=True, kw_only=True):
+class ClockOffset(Record, frozen=True, kw_only=True):
     """Time offset to add to the logged timestamps of the position source.
 
     Attributes
@@ -89,6 +88,8 @@ class Clock(Record, frozen=True, kw_only=True):
         Drift of the source's clock; None with fewer than three parts.
     change_p_value : float or None
         p-value of a constant offset (likelihood ratio test); None with one part.
+    curve_s, curve_drop : ndarray, shape (n,)
+        Time offsets (s), and the decrease of the log-likelihood from its maximum.
     """
 
     offset_s: float
@@ -102,6 +103,10 @@ class Clock(Record, frozen=True, kw_only=True):
     change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
+    curve_s: NotWritten[Array] = NOT_WRITTEN
+    curve_drop: NotWritten[Array] = NOT_WRITTEN
+    sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
+    sigma_z_m: NotWritten[float] = NOT_WRITTEN
 
     @property
     def remaining_s(self) -> float:
@@ -121,24 +126,6 @@ class Clock(Record, frozen=True, kw_only=True):
 
     def is_significant(self, offset_s: float) -> bool:
         return abs(offset_s) > max(MIN_OFFSET_S, self.three_sigma_s)
-
-
-class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
-    """Time offset of the position source, with the likelihood curve and the noises.
-
-    Attributes
-    ----------
-    curve_s, curve_drop : ndarray, shape (n,)
-        Time offsets (s), and the decrease of the log-likelihood from its maximum.
-    """
-
-    schema_type = Clock
-    curve_s: Array
-    curve_drop: Array
-    sigma_a_m_s2: float
-    sigma_z_m: float
-
-    __repr__ = one_line_repr
 
 
 def estimate_time_offset(

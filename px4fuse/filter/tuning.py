@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -70,12 +69,12 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Make a noise from the fields of :class:`NoiseEstimate`."""
+        """Make a noise from the fields of :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """Return value and interval as fields of :class:`NoiseEstimate`."""
+        """Return value and interval as fields of :class:`AxisTuning`."""
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
@@ -98,7 +97,7 @@ class HeldOutCheck(Record, frozen=True):
     log_likelihood_gain_per_measurement: float
 
 
-class NoiseEstimate(Record, frozen=True, kw_only=True):
+class AxisTuning(Record, frozen=True, kw_only=True):
     """Estimated noises of one axis, or of north and east together, with 95 % intervals.
 
     For missing values see :class:`Noise`; ``low`` = None is stored as 0.
@@ -115,6 +114,8 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
         Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
         False if the IMU rate is too low; KF's SIGMA_A is then an upper bound of the noise.
+    noises : Noises
+        Maximum-likelihood noises, including the random walk of a drifting source.
     """
 
     sigma_a_m_s2: NotNegative | None = None
@@ -130,6 +131,9 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     outliers: Count
     held_out: OrUnavailable[HeldOutCheck]
     biases_fitted: bool
+    name: NotWritten[str] = NOT_WRITTEN
+    outlier_time_s: NotWritten[Array] = NOT_WRITTEN
+    noises: NotWritten[Noises] = NOT_WRITTEN
 
     @property
     def sigma_a(self) -> Noise:
@@ -144,27 +148,6 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     @property
     def sigma_z(self) -> Noise:
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
-
-
-class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False):
-    """Estimated noises of one axis, or of north and east together, with outliers.
-
-    Attributes
-    ----------
-    name : str
-        Axis name, or "horizontal".
-    outlier_time_s : ndarray, shape (k,)
-        Timestamps of the outliers.
-    noises : Noises
-        Maximum-likelihood noises, including the random walk of a drifting source.
-    """
-
-    schema_type = NoiseEstimate
-    name: str
-    outlier_time_s: Array
-    noises: Noises
-
-    __repr__ = one_line_repr
 
 
 def tune(

@@ -25,7 +25,7 @@ RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
 }
 ROSTER_COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # Fields of a student that another list adds if the class list does not contain them
-ADDED_FIELDS = ("name", "email", "login", "submitted")
+ADDED_FIELDS = ("name", "email", "login", "submitted", "extended_due")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
@@ -44,6 +44,8 @@ class Person:
         Number of the student on each learning platform, by name of the platform.
     submitted : str
         Submission time as in Moodle's worksheet.
+    extended_due : str
+        Due time of this student, in the form of the option --due; "" for that of the class.
     """
 
     student_id: str
@@ -52,6 +54,7 @@ class Person:
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
     submitted: str = ""
+    extended_due: str = ""
 
     @property
     def file(self) -> str:
@@ -136,7 +139,15 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
     submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
-    person = Person(student_id, name, cells["email"], cells["login"], numbers, submission_time)
+    person = Person(
+        student_id,
+        name,
+        cells["email"],
+        cells["login"],
+        numbers,
+        submission_time,
+        cells["extended_due"],
+    )
     return person if student_id or name or numbers else None
 
 
