@@ -157,7 +157,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(
-            SettingsError, match="the fusion horizon follows from the largest delay parameter"
+            SettingsError, match="the largest delay parameter is the delay of the fusion horizon"
         ):
             what_if(open_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
