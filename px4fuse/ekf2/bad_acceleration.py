@@ -53,7 +53,7 @@ class BadAcceleration:
         self.since_s = np.full(len(follows_log), time_s[0])
         self.until_s = np.full(len(follows_log), time_s[0] + duration_s * float(is_logged[0]))
 
-    def share(self, begin_s: Array, end_s: Array) -> Array | None:
+    def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval with the flag, per configuration; None without a flag.
 
         To be called for successive intervals.
@@ -81,14 +81,14 @@ class BadAcceleration:
         """
         # an innovation is valid until the next innovation of the same sensor
         gnss = previous_ratios[-1]
-        pressure = np.full(len(gnss), np.nan)
+        barometer = np.full(len(gnss), np.nan)
         for ratio in previous_ratios[:-1]:
-            pressure = np.where(np.isnan(ratio), pressure, ratio)
-        is_bad = _is_falling(pressure, gnss)
+            barometer = np.where(np.isnan(ratio), barometer, ratio)
+        is_bad = _is_falling(barometer, gnss)
         for ratio in ratios[:-1]:
-            pressure = np.where(np.isnan(ratio), pressure, ratio)
-            is_bad |= _is_falling(pressure, gnss)
-        is_bad |= _is_falling(pressure, ratios[-1])
+            barometer = np.where(np.isnan(ratio), barometer, ratio)
+            is_bad |= _is_falling(barometer, gnss)
+        is_bad |= _is_falling(barometer, ratios[-1])
         is_bad &= ~self.follows_log
         self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_bad, time_s + self.duration_s, self.until_s)

@@ -211,7 +211,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     ``intervals`` contains the intervals between events, one element per configuration.
     """
     configuration_count = len(configurations)
-    events = len(intervals[0].events)
+    event_count = len(intervals[0].events)
     parameters = {
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
@@ -219,7 +219,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     for name, value in segment.changed.items():  # parameters that were changed in flight
         is_flown = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_flown, value, parameters[name])
-    biases, attitude, has_gate, uses_logged_decisions, uses_reported_noise, fuses_velocity = (
+    (
+        has_biases,
+        has_attitude,
+        has_gate,
+        uses_logged_decisions,
+        uses_reported_noise,
+        fuses_velocity,
+    ) = (
         np.array([getattr(configuration, name) for configuration in configurations])
         for name in (
             "estimates_biases",
@@ -241,9 +248,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         arrays = [getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals]
         return np.stack(arrays, axis=1)[:, configuration_intervals]
 
-    event = stacked("events")
-    action = np.where(has_gate, event["action"], np.where(event["usable"], FUSE, IDLE))
-    event_steps = event["end_step"]
+    event_table = stacked("events")
+    action = np.where(has_gate, event_table["action"], np.where(event_table["usable"], FUSE, IDLE))
+    event_steps = event_table["end_step"]
     is_active = action > IDLE
     event_time_s = segment.time_s[event_steps]
     has_sample = np.any(is_active, axis=1).tolist()
@@ -275,7 +282,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
     field_samples = heights = flow_samples = vision = None
-    has_field, has_flow = np.zeros((2, events), bool)
+    has_field, has_flow = np.zeros((2, event_count), bool)
 
     def enabled_means(source_aid: Aid, samples: Sequence[EventSamples]) -> EventSamples:
         stacked_fields = (
@@ -311,7 +318,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         heights = HeightFilter(
             segment,
             barometer,
-            event["time_s"],
+            event_table["time_s"],
             is_active,
             enabled,
             parameters,
@@ -332,24 +339,26 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         vision = VisionFilter(
             segment, vision_by_configuration, enabled, parameters, has_gate, uses_reported_noise
         )
-    gyro_variance = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
+    gyro_variance = np.where(has_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     variance_increment, variance_limit = _variance_growth(
-        inputs, segment, parameters, biases, attitude
+        inputs, segment, parameters, has_biases, has_attitude
     )
     steps = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (events, 1))[
+    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))[
         :, :, None, None
     ]
-    if (share := segment.clipped_share) is not None:
-        # clipped axes have BAD_ACCELERATION_NOISE: mean fraction of such axes in each interval
-        share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
-        mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
-        acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
-    x, P = _start_state(segment, biases, attitude)
+    if (clipped_fraction := segment.clipped_fraction) is not None:
+        # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
+        fraction_sums = np.diff(
+            np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
+        )
+        mean_fraction = (fraction_sums[:, :, None] / np.maximum(steps, 1))[..., None]
+        acceleration_variance += mean_fraction * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
+    x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
         # the log contains no bias estimate while EKF2 declared its acceleration bad: start with the
         # bias from the published velocity
-        has_bias = ~bad_acceleration.follows_log & biases
+        has_bias = ~bad_acceleration.follows_log & has_biases
         P[has_bias, BIAS_DOWN, :] = 0.0
         P[has_bias, :, BIAS_DOWN] = 0.0
         P[has_bias, BIAS_DOWN, BIAS_DOWN] = INITIAL_BIAS_SIGMA_M_S2**2
@@ -359,33 +368,33 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     logged_correction_m = inputs.received.correction_m if uses_logged_decisions.any() else None
     action_inputs = (
         np.where(is_aid_enabled, action, IDLE),
-        event["can_start"] & is_aid_enabled,
+        event_table["can_start"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
     )
     fusion = _Fusion(inputs.rules, segment.time_s[0], *action_inputs, *logged_decisions)
-    innovations, variances = np.full((2, events, configuration_count, 6), np.nan)
+    innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
     field_record = np.full(
-        (0 if field_samples is None else events, 3, configuration_count, 3), np.nan
+        (0 if field_samples is None else event_count, 3, configuration_count, 3), np.nan
     )
-    is_rejected, is_fused, reset = np.zeros((3, events, configuration_count), bool)
-    position_reset_m = np.zeros((events, configuration_count, 2))
-    states, state_variances = np.empty((2, events + 1, configuration_count, x.shape[1]))
+    is_rejected, is_fused, reset = np.zeros((3, event_count, configuration_count), bool)
+    position_reset_m = np.zeros((event_count, configuration_count, 2))
+    states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
     states[0] = x
     state_variances[0] = _diagonal(P)
     innovation, R = np.empty((2, configuration_count, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
-    for e in range(events):
+    for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
             transition = stacked("transition", event_batch)
-            state_input = stacked("acceleration_input", event_batch) + attitude[:, None] * stacked(
-                "correction_input", event_batch
-            )
+            state_input = stacked("acceleration_input", event_batch) + has_attitude[
+                :, None
+            ] * stacked("correction_input", event_batch)
             added_noise = gyro_variance * stacked("gyro_noise", event_batch)
             accelerometer_noise = stacked("accelerometer_noise", event_batch)
             added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
@@ -397,9 +406,13 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         is_bias_constant = None
-        share = bad_acceleration.share(event_time_s[e - 1] if e else start_s, event_time_s[e])
-        if share is not None:
-            increase = share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0])
+        flagged_fraction = bad_acceleration.flagged_fraction(
+            event_time_s[e - 1] if e else start_s, event_time_s[e]
+        )
+        if flagged_fraction is not None:
+            increase = flagged_fraction * (
+                BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0]
+            )
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 increase[:, None, None] * accelerometer_noise[batch_index]
             )
@@ -409,7 +422,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
         if inputs.rules.min_bias_variance is not None:
-            _limit_bias(P, inputs.rules.min_bias_variance, biases)
+            _limit_bias(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
@@ -477,7 +490,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if field_samples is None:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
             R[:, :2] = _noise_to_reach(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
-            heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
+            heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.vision_height or heights is not None:
                 R[:, 1] = IGNORED_VARIANCE
                 if has_sample[e] and heights is None:

@@ -189,7 +189,7 @@ class HeightFilter:
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
-        self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
+        self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
@@ -207,7 +207,7 @@ class HeightFilter:
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
-    def updates(self, sensor: str, configuration: int, end_s: Array) -> pd.DataFrame:
+    def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
         """Return the updates of one filter configuration with one sensor, at measurement times.
 
         ``end_s`` is the time of each event.
@@ -216,9 +216,9 @@ class HeightFilter:
         slots = len(self.down_m)
         for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
             times = self.time_s[slot]
-            has_sample = self.has_sample[slot][:, configuration]
-            measured_s = times[has_sample, min(configuration, times.shape[1] - 1)]
-            updates = self.update_log[has_sample, slot, :, configuration].T
+            has_sample = self.has_sample[slot][:, configuration_index]
+            measured_s = times[has_sample, min(configuration_index, times.shape[1] - 1)]
+            updates = self.update_log[has_sample, slot, :, configuration_index].T
             rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
         measured_s, nu, S, is_fused, end_s = np.hstack(rows)
         columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
@@ -282,12 +282,12 @@ class HeightFilter:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = predicted_variance + R
         has_sample = self.has_sample[slot, e]
-        is_fused = has_sample & (nu * nu <= self.gate2[sensor_index] * S)
+        is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
                 has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot][e])
             )
-            limit = np.sqrt(self.gate2[sensor_index] * S)
+            limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -limit, limit), nu)
             is_fused |= is_clipped
         update_log = self.update_log[e, slot]

@@ -189,7 +189,7 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model, by PX4 name.
     late, lost : int
-        Samples that arrived after the fusion horizon: fused late, and never fused.
+        Number of samples that were fused late, and that were too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
         Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
     other_aid_updates : mapping from PX4's name to DataFrame
@@ -551,7 +551,7 @@ def _agreement_verdict(
     nis = max(abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values())
     text = (
         f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
-        f"the mean NIS of both differs by {nis:.0%}"
+        f"the mean NIS differs by {nis:.0%}"
     )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis > MAX_NIS_DIFFERENCE:
         return False, (

@@ -161,7 +161,7 @@ class ReplaySegment:
         Estimated correlations of the initial state.
     field, flow : SensorSamples or None
     heights : HeightSamples or None
-    clipped_share : ndarray, shape (n + 1,), or None
+    clipped_fraction : ndarray, shape (n + 1,), or None
         Fraction of the accelerometer axes that are clipped in the step.
     is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
         Logged flag for a bad vertical acceleration.
@@ -191,7 +191,7 @@ class ReplaySegment:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    clipped_share: Array | None = None
+    clipped_fraction: Array | None = None
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
@@ -286,7 +286,7 @@ def find_replay_segments(
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     fused_s = innovations.index.to_numpy()
-    states = record.delayed.index.to_numpy()
+    state_times_s = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
@@ -312,10 +312,12 @@ def find_replay_segments(
         starts = [start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high]
         if field_span and low <= field_span[0] < high:
             starts.append(field_span[0])
-        start_row = int(np.searchsorted(states, max([fused_inside[0] + MIN_FUSION_S, *starts])))
-        if start_row == len(states) or high - states[start_row] < MIN_SEGMENT_S:
+        start_row = int(
+            np.searchsorted(state_times_s, max([fused_inside[0] + MIN_FUSION_S, *starts]))
+        )
+        if start_row == len(state_times_s) or high - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (time[1:] > states[start_row]) & (time[:-1] < high)
+        is_covered = (time[1:] > state_times_s[start_row]) & (time[:-1] < high)
         if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
         segment_inputs = imu, attitude, ekf2, record
@@ -326,12 +328,14 @@ def find_replay_segments(
             continue
         segment = _make_gnss_segment(*segment_inputs, start_row, high)
         history_row = int(
-            np.searchsorted(states, max(first_s, states[start_row] - CORRELATION_HISTORY_S))
+            np.searchsorted(
+                state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
+            )
         )
         if history_row < start_row:
-            history = _make_gnss_segment(*segment_inputs, history_row, states[start_row])
+            history = _make_gnss_segment(*segment_inputs, history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
-        if field_span and field_span[0] <= states[start_row] and high <= field_span[1]:
+        if field_span and field_span[0] <= state_times_s[start_row] and high <= field_span[1]:
             segment = _add_field(segment, record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed=changed))
     return tuple(segments)
@@ -359,7 +363,7 @@ def _make_gnss_segment(
         state=state,
         metres=metres,
         correction_rad=segment.correction_rad + earth_rotation_rad,
-        clipped_share=_clipped_share(imu, segment.time_s),
+        clipped_fraction=_clipped_fraction(imu, segment.time_s),
         is_acceleration_bad=(
             record.was_in_state(BAD_ACCELERATION, segment.time_s)
             if BAD_ACCELERATION in record.states
@@ -388,15 +392,17 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     return breaks
 
 
-def _clipped_share(imu: pd.DataFrame, time_s: Array) -> Array:
+def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
     """Return the fraction of the accelerometer axes that are clipped in the step before a time."""
-    share_by_step = np.zeros(len(time_s))
+    fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
-        clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
-        np.maximum.at(share_by_step, np.searchsorted(time_s, clipped.index), clipped_share)
-    return share_by_step
+        clipped_fraction = (
+            np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+        )
+        np.maximum.at(fraction_by_step, np.searchsorted(time_s, clipped.index), clipped_fraction)
+    return fraction_by_step
 
 
 def _make_segment(

@@ -107,7 +107,7 @@ class VisionFilter:
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.without_gnss = ~enabled[GNSS_POS.name]
-        self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
+        self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
         )
@@ -123,14 +123,14 @@ class VisionFilter:
         self.fused_s = np.full(configuration_count, start_s)
         self.was_without_gnss = self.without_gnss[0]
 
-    def updates(self, configuration: int, end_s: Array) -> pd.DataFrame:
+    def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
         """Return the vision updates of one filter configuration at measurement times.
 
         ``end_s`` is the time of each event.
         """
-        update_log = self.update_log[..., configuration]
+        update_log = self.update_log[..., configuration_index]
         event, slot = np.nonzero(np.isfinite(update_log[:, :, 0]))
-        index = pd.Index(self.measured_at_s[slot, event, configuration], name="time_s")
+        index = pd.Index(self.measured_at_s[slot, event, configuration_index], name="time_s")
         updates = pd.DataFrame(update_log[event, slot], index, UPDATE_COLUMNS[:7])
         return updates.assign(fused_at_s=end_s[event])
 
@@ -169,7 +169,7 @@ class VisionFilter:
             without_gnss != self.was_without_gnss
         )
         is_outside_gate = (
-            (nu * nu > self.gate2 * diagonal).any(axis=1) & self.has_gate & ~has_restarted
+            (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
         is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
         restarts = has_sample & (has_restarted | is_failing)

@@ -132,7 +132,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     heights, others : mapping from PX4's name to HeightSummary
         Replayed height sensors, and vision that is fused in addition to GNSS.
     late, lost : int
-        Samples that arrived after the fusion horizon: fused late, and never fused.
+        Number of samples that were fused late, and that were too late to be fused.
     is_predictable : bool
         False if the statistics depend on the rejection of single samples.
     """
