@@ -1,7 +1,6 @@
-"""Base class of the records in results: immutable, strictly typed, and written without change.
+"""Base class of the records in results, and :class:`Unavailable` for missing data.
 
-Field names contain the unit. If a number cannot be computed, the number is absent, or an
-:class:`Unavailable` replaces its record.
+Field names contain the unit.
 """
 
 from __future__ import annotations
@@ -25,14 +24,9 @@ Vector = tuple[float, float, float]
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Immutable record; fields that are None are not written to the results.
+    """Immutable record; fields that are None are not written to the results."""
 
-    Attributes
-    ----------
-    schema_type : type or None
-        Base class with the fields in the results, if the record also contains arrays or tables.
-    """
-
+    # Base class with the fields that are written, for a record that also contains arrays or tables
     schema_type: ClassVar[type[Record] | None] = None
 
 
@@ -68,10 +62,9 @@ if TYPE_CHECKING:
 else:
 
     class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
+        """``RecordOrUnavailable[T, A]``: a record T, or an Unavailable of type A.
 
-        Each union is a separate type, which :func:`decode_record_or_unavailable` decodes, because
-        msgspec decodes unions of structs only if they have tags, and records have no tags.
+        msgspec itself decodes such a union only if both types have tags.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -90,13 +83,7 @@ else:
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable`, as ``dec_hook`` of msgspec.
-
-    Raises
-    ------
-    ValueError
-        The value is neither the record nor an Unavailable.
-    """
+    """Decode a :class:`RecordOrUnavailable` for msgspec (argument ``dec_hook``)."""
     record_type, unavailable_type = union_type.union_members
     kind = (
         unavailable_type
@@ -110,7 +97,7 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
 
 
 def to_serializable(value: Any) -> Any:
-    """Convert a record and the records in it to their schema types, without arrays and tables."""
+    """Convert a record and the records in it for writing: arrays and tables are omitted."""
     if isinstance(value, Record):
         kind = value.schema_type or type(value)
         return kind(
