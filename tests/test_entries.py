@@ -341,7 +341,7 @@ def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
         ("1,,5,", "for an item or total"),
-        ("1,A,5,\n1,A,6,", "student 1 has another row for item A"),
+        ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )
 def test_read_overrides_with_invalid_row_raises_error(tmp_path, row, says) -> None:

@@ -84,8 +84,9 @@ MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# Titles of feedback columns, which the learning platform reads as HTML, or as HTML or text
+# Titles of feedback columns that the learning platform reads as HTML
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
+# Titles of all feedback columns
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
 # Text in columns that Canvas computes and px4fuse therefore does not change
@@ -97,14 +98,11 @@ def write_class(
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Rows of the class table: the students in ``course.register`` first, in the same order.
+    The students in ``course.register`` are first in ``entries``, in the same order.
 
     Returns
     -------
-    written : tuple of Path
+    written_paths : tuple of Path
         Files and folders.
     notes : tuple of str
         Sentences about grades that could not be entered.
@@ -163,13 +161,13 @@ def write_class(
 
 
 def _entry_identity(entry: Entry, stem: bool = False) -> str:
-    """Return id, else name, else file name: the identity of a row in all runs of grading."""
+    """Return the id of a student, or else the name, or else the file name."""
     file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy a redrawn report to ``reports`` and its diagnosis to ``feedback``; add the path."""
+    """Copy the redrawn report and its diagnosis to the output folder, for the class page."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
@@ -185,10 +183,9 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
+    """Replace names by pseudonyms, and sort by pseudonym; also return the table of names as CSV.
 
-    Pseudonyms are assigned in random order. A later run reads the pseudonyms from the table at
-    ``path``.
+    The pseudonyms in the table at ``path`` are kept, others are assigned in random order.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -252,12 +249,9 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def csv_text(entries: Sequence[Entry]) -> str:
-    """Format the class table as CSV for spreadsheet programs; points include the instructor's.
-
-    The text begins with the byte order mark, by which Excel detects UTF-8, and lines end with CRLF.
-    """
-    items, numbers = list_titles(entries)
-    titles = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
+    """Format the class table as CSV for Excel and LibreOffice."""
+    item_titles, number_titles = list_titles(entries)
+    titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
     rows = []
     for entry in entries:
         report = entry.counted_report
@@ -272,8 +266,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
             entry.max_points,
             entry.deduction or None,
             entry.total,
-            *map(points_by_title.get, items),
-            *(report.numbers.get(title) if report else None for title in numbers),
+            *map(points_by_title.get, item_titles),
+            *(report.numbers.get(title) if report else None for title in number_titles),
             entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
             report.pending_reason if report else "",
@@ -289,7 +283,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
         ]
         cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
         rows.append(tuple(cells))
-    return "\ufeff" + Sheet(Path(), titles, tuple(rows)).text
+    # Excel detects UTF-8 by the byte order mark
+    return "\ufeff" + Sheet(Path(), tuple(map(neutralise_formulas, titles)), tuple(rows)).text
 
 
 # ------------------------------------------------------------------ feedback
@@ -329,11 +324,8 @@ def _wrap_text(text: str, indent: str = "") -> str:
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Return the index of the grade column in a table of a learning platform.
 
-    Parameters
-    ----------
-    column_title : str
-        Title of the column, for Canvas without the number in brackets; "" if the table has only one
-        grade column.
+    ``column_title`` is "" if the table has only one grade column. The title of a column in Canvas
+    may lack the number in brackets.
 
     Raises
     ------
@@ -375,25 +367,10 @@ def fill_grades(
     feedback: Sequence[str],
     scale: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
-    """Enter grades and feedback into a table of a learning platform.
+    """Enter grades and feedback into a copy of a table of a learning platform.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Rows of the class table: the students in ``register`` first, in the same order.
-    column : str
-        Title of the grade column; "" if the table has only one.
-    feedback : sequence of str
-        Feedback for the student of each row.
-    scale : float or None
-        Maximum points on the learning platform; None to enter the points of the rubric.
-
-    Returns
-    -------
-    filled_sheet : Sheet
-        Copy of the table with grades and feedback.
-    notes : tuple of str
-        Sentences about grades that were not entered, or are above the maximum.
+    The students in ``register`` are first in ``entries`` and ``feedback``, in the same order. The
+    notes are sentences about grades that were not entered, or that are above the maximum.
 
     Raises
     ------
