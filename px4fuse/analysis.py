@@ -34,7 +34,7 @@ class Analysis(Comparison, Estimates, Reruns):
     ekf2_model, difference_steps, trials
         See :class:`~px4fuse.comparison.causal_replays.Reruns`.
     events : Events
-        Gaps, rejections, resets and flight modes, for time plots.
+        Gaps, rejections and resets, for time plots.
     aids : mapping from PX4's name to AidResult, or Unavailable
         Innovation statistics of each aiding source of EKF2.
     loop : Loop or Unavailable

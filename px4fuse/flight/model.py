@@ -92,15 +92,6 @@ class Columns:
     ]
 
 
-@dataclass(frozen=True)
-class FlightMode:
-    """Time interval (s) in one flight mode, with the name that QGroundControl shows."""
-
-    start_s: float
-    end_s: float
-    name: str
-
-
 class Alignment(Record, frozen=True, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
@@ -532,13 +523,6 @@ class Truth:
     __repr__ = one_line_repr
 
 
-MODES_NOT_LOGGED = Unavailable(
-    "flight modes",
-    "vehicle_status is not logged or not usable",
-    "Record with SDLOG_PROFILE bit 0 (default).",
-)
-
-
 # Flights are compared by identity (eq=False), because caches use flights as keys
 @dataclass(frozen=True, eq=False)
 class Flight:
@@ -569,8 +553,6 @@ class Flight:
         Other position-related data in the log that px4fuse does not use.
     inputs : tuple of InputFile
         Files read in addition to the log.
-    modes : tuple of FlightMode, or Unavailable
-        Flight modes in order of time, without overlap.
     tumble_spans : tuple of (float, float)
         Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits.
     barometer : DataFrame or None
@@ -589,7 +571,6 @@ class Flight:
     clocks: tuple[ClockMap, ...] = ()
     unused: tuple[UnusedData, ...] = ()
     inputs: tuple[InputFile, ...] = ()
-    modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
     tumble_spans: Spans = ()
     barometer: pd.DataFrame | None = None
 
