@@ -123,7 +123,7 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class Correction(Record, frozen=True, kw_only=True):
-    """Size (m) of a path correction, cost of its pose graph, and scores against each reference."""
+    """Path correction for results.json: displacement of the poses, pose graph cost, and scores."""
 
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
@@ -204,7 +204,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     original_frame : Frame
         Frame of the trajectory before the conversion to z down.
     is_assessed : bool
-        True if the flight is an assignment, so that its findings are withheld.
+        True if the flight is an assignment: px4fuse withholds its findings.
     """
 
     schema_type = LoopResult
@@ -231,7 +231,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Paths for reports: all available paths that differ from the other paths."""
+        """Available paths without duplicates."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
