@@ -23,7 +23,7 @@ FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 MAX_GRID_ERROR_S = 0.006
 # Minimum number of logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals with n, and with n + 1, receiver intervals, to estimate the
+# Minimum number of logged intervals of n and of n + 1 receiver intervals for an estimate of the
 # receiver interval
 MIN_REPEATED_INTERVALS = 3
 # Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
@@ -71,26 +71,21 @@ def reconstruct_fixes(
 ) -> tuple[pd.DataFrame, str]:
     """Reconstruct unlogged fixes between logged fixes as EKF2 position plus innovation.
 
-    1. Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
-       log time. That fix is a whole number n of receiver intervals after a logged fix.
-    2. For n = 0 the fix itself is logged, which gives the reconstruction error. If the error
-       exceeds MAX_RECONSTRUCTION_ERROR_M, no fixes are returned.
+    Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
+    time, which is a whole number of receiver intervals after a logged fix. Fixes that are logged
+    give the reconstruction error, which must not exceed MAX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
     fixes : DataFrame
-        Logged fixes: positions (m, NED) and variances, indexed by the measurement time that EKF2
-        assumes.
-    ekf2 : Ekf2 or Unavailable
+        Logged fixes (m, NED) at the measurement times that EKF2 assumes.
     delay_s : float
-        Delay between measurement and timestamp that EKF2 assumes. A fix older than the fusion
-        horizon is fused at the horizon (``RingBuffer.h``).
+        Delay between measurement and timestamp that EKF2 assumes.
 
     Returns
     -------
     (DataFrame, str)
-        Fixes that are not in ``fixes``, with interpolated heights, and a note; empty if no fix can
-        be reconstructed.
+        Reconstructed fixes with interpolated heights, and a note; both empty without any.
     """
     no_fixes = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
@@ -101,6 +96,7 @@ def reconstruct_fixes(
     interval_s = _interval_s(fix_s)
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes
+    # A fix older than the fusion horizon is fused at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
     previous_fix = np.searchsorted(fix_s, fused_s) - 1
