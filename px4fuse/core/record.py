@@ -8,10 +8,12 @@ from __future__ import annotations
 from abc import ABCMeta
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union
 
 import msgspec
 from msgspec import Meta
+
+from px4fuse.core.notebook_display import one_line_repr
 
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -23,11 +25,18 @@ Span = tuple[float, float]
 Vector = tuple[float, float, float]
 
 
-class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Immutable record; fields that are None are not written to the results."""
+# Default value of a field that is not written to the results
+NOT_WRITTEN: Any = msgspec.UNSET
 
-    # Base class with the fields that are written, for a record that also contains arrays or tables
-    schema_type: ClassVar[type[Record] | None] = None
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Immutable record; fields that are None are not written to the results.
+
+    Fields of the type :class:`NotWritten` (arrays, tables) are not written either, and are missing
+    in records that were read from results.
+    """
+
+    __repr__ = one_line_repr
 
 
 class Unavailable(Record, frozen=True):
@@ -59,7 +68,14 @@ A = TypeVar("A")
 if TYPE_CHECKING:
     RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - generic alias
     OrUnavailable: TypeAlias = Union[T, Unavailable]  # noqa: UP007
+    NotWritten: TypeAlias = Annotated[T, "not written"]
 else:
+
+    class NotWritten:
+        """``NotWritten[T]``: a value T that results do not contain."""
+
+        def __class_getitem__(cls, kind: object) -> type:
+            return msgspec.UnsetType
 
     class RecordOrUnavailable:
         """``RecordOrUnavailable[T, A]``: a record T, or an Unavailable of type A.
@@ -97,12 +113,14 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
 
 
 def to_serializable(value: Any) -> Any:
-    """Convert a record and the records in it for writing: arrays and tables are omitted."""
+    """Remove from a record, and the records in it, the fields that are not written."""
     if isinstance(value, Record):
-        kind = value.schema_type or type(value)
-        return kind(
-            **{name: to_serializable(getattr(value, name)) for name in kind.__struct_fields__}
+        written = (
+            field.name
+            for field in msgspec.structs.fields(value)
+            if field.type is not msgspec.UnsetType
         )
+        return type(value)(**{name: to_serializable(getattr(value, name)) for name in written})
     if isinstance(value, Mapping):
         return {key: to_serializable(child) for key, child in value.items()}
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
