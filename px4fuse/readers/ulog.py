@@ -115,10 +115,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples, and record their topic as stream.
-
-    The result is Unavailable if the log contains fewer than two samples.
-    """
+    """Return the samples, or the reason why too few are in the log."""
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)
