@@ -1,9 +1,7 @@
-"""Write one Markdown page per finding: meaning, example, action, rates and thresholds.
+"""Write one Markdown page per finding: meaning, example, action, error rates and thresholds.
 
-``write(folder)`` writes ``index.md`` and ``<id>.md`` for each finding. The thresholds are read from
-the source code of the detectors, the rates from ``tests/studies/rates.csv``. The examples are
-findings on simulated flights. ``px4fuse explain`` prints them from a file; update this file after a
-change of messages or rates:
+The examples are findings on simulated flights. ``px4fuse explain`` prints them from a file. Update
+this file after a change of messages or rates:
 
     python docs/findings_pages.py --examples
 """
@@ -193,15 +191,17 @@ def detectors() -> dict[str, str]:
     return found | composed
 
 
-def thresholds(stem: str) -> Iterator[str]:
+def thresholds(module_name: str) -> Iterator[str]:
     """Yield a Markdown table row with value and comment of each constant of a detector module."""
-    source = (FINDINGS / f"{stem}.py").read_text(encoding="utf-8")
+    source = (FINDINGS / f"{module_name}.py").read_text(encoding="utf-8")
     lines = source.splitlines()
     for node in ast.parse(source).body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant | ast.UnaryOp):
             name, line = ast.unparse(node.targets[0]), lines[node.lineno - 1]
-            before = lines[node.lineno - 2]
-            comment = line.partition("  # ")[2] or (before[2:] if before.startswith("# ") else "")
+            line_above = lines[node.lineno - 2]
+            comment = line.partition("  # ")[2] or line_above.removeprefix("# ") * (
+                line_above.startswith("# ")
+            )
             if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
                 comment = comment.replace("|", r"\|")
                 yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
@@ -251,11 +251,11 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
         yield "|---|---|---|---|---|"
         yield "\n".join(found) + "\n"
-    stem = detectors()[name]
-    rows = list(thresholds(stem))
+    module_name = detectors()[name]
+    rows = list(thresholds(module_name))
     if rows:
         yield "## Thresholds\n"
-        yield f"The file `px4fuse/findings/{stem}.py` contains these thresholds."
+        yield f"The file `px4fuse/findings/{module_name}.py` contains these thresholds."
         yield "Some of them belong to other findings.\n"
         yield "| name | value | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
@@ -266,13 +266,13 @@ def links(names: Iterable[str]) -> str:
     return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
-def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
-    """Return message, action and rates of each finding, which ``px4fuse explain`` prints."""
+def packaged_examples(simulated: Mapping[str, Example]) -> dict[str, Any]:
+    """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
     table, recorded, contents = measured_rates(), load_examples(), {}
     for name in TITLES:
         rows = table[table["finding"] == name]
         clean = rows[rows["condition"] == "none"]
-        example = made[name].finding if name in made else recorded[name]
+        example = simulated[name].finding if name in simulated else recorded[name]
         contents[name] = {
             "message": example.message,
             "remedy": example.remedy,

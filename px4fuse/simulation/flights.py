@@ -35,21 +35,7 @@ ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated flight: logged topics, and the true values that the log does not contain.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    mistakes : Mistakes
-    motion : Motion
-        True motion as a function of time.
-    positions : SimulatedPositions
-        Positions with their outliers and errors.
-    topics : tuple of Topic
-        All logged topics.
-    parameters : mapping
-        Logged parameters, by PX4 name.
-    """
+    """Simulated flight: logged topics and parameters, and values that the log does not contain."""
 
     scenario: Scenario
     mistakes: Mistakes
@@ -156,16 +142,7 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
 
 
 def answer(simulation: Simulation) -> dict[str, Any]:
-    """Return the true values of a simulated flight for the instructor, as JSON types.
-
-    Keys
-    ----
-    mistakes
-        Help text and expected finding of each injected fault, by name.
-    truth
-        Biases, noises, time offset to add to the position timestamps, outliers (index and time in
-        the logged topic), and loop closure error.
-    """
+    """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions
     accelerometer, gyro = sensors.biases(scenario, mistakes)

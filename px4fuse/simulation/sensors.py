@@ -98,17 +98,16 @@ class SimulatedPositions:
 
     Attributes
     ----------
-    topic : Topic
-    is_outlier : ndarray of bool, shape (n,)
-        True for positions that are simulated outliers.
     position_m : ndarray, shape (n, 3)
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
         Velocity measured by GNSS, NED; None for UWB and VIO.
     measured_s : ndarray, shape (n,)
         True times of measurement (s from the first data).
-    distance_m, drift_m : float, ndarray of shape (3,)
-        Horizontal distance flown, and VIO drift at the end (NED).
+    distance_m : float
+        Horizontal distance flown.
+    drift_m : ndarray, shape (3,)
+        VIO drift at the end, NED.
     """
 
     topic: Topic
@@ -253,10 +252,10 @@ def attitude_topic(
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
-    tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
+    tilt_deg, yaw_deg = scenario.tilt_error_deg, scenario.yaw_error_deg
+    rms_rad = np.radians([tilt_deg, tilt_deg, yaw_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
-    rms = np.array([tilt, tilt, yaw])
-    error = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0]
+    error = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
         size = np.radians(mistakes.heading_deg)
         if mistakes.heading_at_s is not None:
@@ -273,8 +272,8 @@ def land_detector(motion: Motion) -> Topic:
     time_us = np.union1d(
         np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), changes_us
     )
-    landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
-    landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
+    is_landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
+    landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
     return topic("vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags})
 
 
@@ -358,7 +357,8 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
 
 
 def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
-    """Return the σ (m) that the source reports; at least 0.01 m without ``r_scale`` (EKF2.cpp)."""
+    """Return the σ (m) that the source reports."""
+    # EKF2.cpp uses at least 0.01 m
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
@@ -382,10 +382,10 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 def outliers(
     scenario: Scenario, mistakes: Mistakes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
-    """Simulate outliers: error of each position (m, NED), shape (n, 3), and mask of the outliers.
+    """Simulate outliers; return the errors (m, NED), shape (n, 3), and a mask of the outliers.
 
-    Outliers occur in bursts while airborne, as from an anchor without line of sight. A burst has
-    one horizontal direction; the sizes are 0.5 to 1.5 times ``nlos_size_m``.
+    Outliers occur in bursts in one horizontal direction, as from an anchor without line of sight.
+    The sizes are 0.5 to 1.5 times ``nlos_size_m``.
     """
     offset_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
@@ -419,8 +419,7 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     """Return a mask of the samples that a logger with a rate limit (Hz) writes; 0 is no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # a logging interval starts 1e-6 intervals early, so that rounding does not move a sample at its
-    # start into the previous interval
+    # the added 1e-6 prevents that rounding moves a sample into the previous logging interval
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
