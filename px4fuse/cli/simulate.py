@@ -41,8 +41,9 @@ _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: Kind = "outdoor"
 SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
-# Options that require --assignment, and all options that are allowed together with it
+# Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
+# All options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
     "output",
     "assignment",

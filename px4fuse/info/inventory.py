@@ -39,7 +39,7 @@ SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # Fields of Flight that the JSON output of px4fuse info contains without change
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Displayed name of each kind of data in a flight, by its name in Flight.streams
+# Label of each kind of data, by its name in Flight.streams
 PART_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",

@@ -20,7 +20,7 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Axes or elements of a vector or quaternion, by the placeholder in columns.csv
+# Names that replace a placeholder in columns.csv, in one row for each name
 COMPONENTS = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),

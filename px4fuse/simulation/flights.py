@@ -103,7 +103,6 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    """Simulate a flight, and read its ULog as :func:`px4fuse.read_log` does."""
     return to_flight(simulate(scenario, mistakes))
 
 

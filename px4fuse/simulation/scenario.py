@@ -165,18 +165,15 @@ class Scenario:
 
     @property
     def nose_follows_path(self) -> bool:
-        """True if the nose points along the direction of flight."""
         return self.yaw == "follow" or (self.yaw is None and self.kind != "aisle")
 
     @property
     def source_rate_hz(self) -> float:
-        """Rate of the position source (Hz)."""
         rates = {"aisle": self.uwb_rate_hz, "loop": self.vio_rate_hz, "outdoor": self.gnss_rate_hz}
         return rates[self.kind]
 
     @property
     def source_sigma_m(self) -> float:
-        """White noise of the position source (m)."""
         sigmas = {"aisle": self.sigma_uwb_m, "loop": self.sigma_vio_m, "outdoor": self.sigma_gnss_m}
         return sigmas[self.kind]
 

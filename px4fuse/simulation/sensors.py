@@ -152,7 +152,6 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Simulate vehicle_magnetometer at the full rate."""
     time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
     # outdoors the measured field is rotated, which causes the heading error of EKF2
@@ -168,7 +167,6 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    """Simulate vehicle_air_data (barometer) at the full rate."""
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
@@ -232,14 +230,12 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    """Make vehicle_attitude_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
 def quaternions(body_to_ned: Array) -> Array:
-    """Convert rotation matrices to quaternions (w, x, y, z)."""
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
@@ -278,7 +274,6 @@ def land_detector(motion: Motion) -> Topic:
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    """Make vehicle_local_position_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
     fields = timestamps(time_us) | vectors(
@@ -459,7 +454,6 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """Make vehicle_gps_position from positions relative to HOME_POSITION."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
     accuracy_fields = {
         "eph": sigma_m,
@@ -499,7 +493,6 @@ def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
 
 
 def seconds(time_us: NDArray[np.int64]) -> Array:
-    """Convert microseconds to seconds."""
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 

@@ -44,7 +44,6 @@ class PageDifference:
 
     @property
     def sentence(self) -> str:
-        """Description of the difference, with the page number in front."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 

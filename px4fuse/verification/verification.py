@@ -95,12 +95,10 @@ class NotRepeatableError(Exception):
 
 
 def log_sha256(results: ReportedResults) -> str:
-    """Return the SHA-256 of the log that a report analyses."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
 def log_name(results: ReportedResults) -> str:
-    """Return the file name of the log that a report analyses."""
     if isinstance(results, LoopResults):
         return split_track(results.track.name)[0]
     return results.log.name
@@ -418,7 +416,6 @@ def _is_near(path: str, submitted_number: float, new_number: float, is_estimate:
 
 
 def _is_same(submitted_value: Any, new_value: Any, is_same_number: TextComparison) -> bool:
-    """Return True if two values are equal, texts up to the rounding of their numbers."""
     if isinstance(submitted_value, str) and isinstance(new_value, str):
         return is_same_text_rounded(submitted_value, clean_text(new_value), is_same_number)
     return type(submitted_value) is type(new_value) and bool(submitted_value == new_value)
