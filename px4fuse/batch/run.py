@@ -179,7 +179,7 @@ def run(
     """
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
         raise SettingsError(
-            "batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
+            "px4fuse batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
         )
     logs = find_logs(paths)
     check_output_folder(output)

@@ -76,7 +76,7 @@ def batch(
         click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
         return
     if output is None:
-        raise SettingsError("batch requires an output folder: -o DIR.")
+        raise SettingsError("px4fuse batch requires an output folder: -o DIR.")
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.batch.run import run

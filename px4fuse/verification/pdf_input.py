@@ -145,7 +145,7 @@ def _check_file(pdf: bytes) -> None:
             not pdf.startswith(b"%PDF-"),
             "the file is not a PDF. Hand in the file that px4fuse wrote.",
         ),
-        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
+        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand in the complete file."),
     ):
         if has_problem:
             raise ResultsError(reason)

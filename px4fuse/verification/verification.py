@@ -238,7 +238,7 @@ def verify(
     if version != own_version:
         version = one_line(version, 40)
         reason = f"the report was made with px4fuse {version}; this is px4fuse {own_version}"
-        return cannot_verify(reason, f"Verify it with px4fuse {version}.")
+        return cannot_verify(reason, f"Verify the report with px4fuse {version}.")
     name = one_line(log_name(results), 80) or "the log"
     if not logs:
         return cannot_verify(NO_LOG_REASON, f"Add {name} to --logs.", name)
@@ -315,7 +315,7 @@ def _verify_with_log(
     if other_libraries:  # other library versions may draw other pages
         versions = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(f"the report was made with {versions}; this computer has other versions")
-        remedy = remedy or f"Verify it with {versions}."
+        remedy = remedy or f"Verify the report with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
     listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
     return Verdict(

@@ -120,8 +120,7 @@ class Course:
         return Register(people, *people_by_sheet)
 
 
-# Sort key of a report (submission time, time of the zip entry), the report, and its row of the class
-# table
+# Sort key of a report (submission time, time of the zip entry), report, and row of the class table
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
