@@ -171,10 +171,10 @@ def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
 def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
     from px4fuse.report.style import MUTED_COLOUR
 
-    previous = ""
+    previous_part = ""
     for source in inventory.sources:
-        data_type = source.part if source.part != previous else ""
-        previous = source.part
+        data_type = source.part if source.part != previous_part else ""
+        previous_part = source.part
         if source.unavailable:
             # another table contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))

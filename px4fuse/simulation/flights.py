@@ -144,7 +144,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions
-    accelerometer, gyro = sensors.biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, mistakes)
     first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
     timestamps_us = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
     outlier_indices = np.flatnonzero(source.is_outlier)
@@ -167,8 +167,8 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                 "sigma_z_m": scenario.source_sigma_m,
                 "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, mistakes.vibration_m_s2)),
                 "reported_sigma_m": sensors.reported_sigma_m(scenario, mistakes),
-                "accelerometer_bias_m_s2": accelerometer.tolist(),
-                "gyro_bias_rad_s": gyro.tolist(),
+                "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
+                "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
                 "clock_offset_to_add_s": 0.0 - mistakes.clock_offset_s,
                 "outlier_index": outlier_indices.tolist(),
                 "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),

@@ -122,31 +122,31 @@ class SimulatedPositions:
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
     rng = random_stream(scenario, Stream.BIAS)
-    accelerometer = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
-    accelerometer[0] += mistakes.accel_bias_m_s2
-    return accelerometer, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
+    accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
+    accelerometer_bias_m_s2[0] += mistakes.accel_bias_m_s2
+    return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
 
 
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(seconds(time_us)))
-    bias_a, bias_g = biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
     rng = random_stream(scenario, Stream.IMU)
     shape = (len(time_us), 3)
-    force = truth.specific_force_m_s2 + bias_a
-    force += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
-    rate = truth.angular_rate_rad_s + bias_g
-    rate += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
+    force_m_s2 = truth.specific_force_m_s2 + accelerometer_bias_m_s2
+    force_m_s2 += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
+    rate_rad_s = truth.angular_rate_rad_s + gyro_bias_rad_s
+    rate_rad_s += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
+        force_m_s2 += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
         "timestamp": _to_boot_time(time_us),
-        "gyro_rad": rate,
-        "accelerometer_m_s2": force,
+        "gyro_rad": rate_rad_s,
+        "accelerometer_m_s2": force_m_s2,
     }
     return topic("sensor_combined", sample_fields | integral_fields)
 
@@ -211,13 +211,15 @@ def mean_imu_at_rest(
 ) -> tuple[Array, Array]:
     """Simulate the mean specific force (m/s²) and angular rate (rad/s) at rest before the log."""
     truth = attitude(motion.at(np.zeros(1)))
-    bias_a, bias_g = biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
     rng = random_stream(scenario, Stream.REST)
     noise_factor = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
-    force = truth.specific_force_m_s2[0] + bias_a
-    force += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
-    rate = truth.angular_rate_rad_s[0] + bias_g
-    return force, rate + noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(3)
+    force_m_s2 = truth.specific_force_m_s2[0] + accelerometer_bias_m_s2
+    force_m_s2 += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
+    rate_rad_s = truth.angular_rate_rad_s[0] + gyro_bias_rad_s
+    return force_m_s2, rate_rad_s + noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(
+        3
+    )
 
 
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
@@ -360,9 +362,9 @@ def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
-    decay = np.exp(-interval_s / mistakes.slow_error_s)
-    noise[1:] *= np.sqrt(1.0 - decay**2)
-    return np.asarray(lfilter([1.0], [1.0, -decay], noise, axis=0))
+    decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
+    noise[1:] *= np.sqrt(1.0 - decay_factor**2)
+    return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
@@ -472,9 +474,13 @@ def _gnss_topic(
 
 
 def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
-    decay = np.exp(-interval_s / time_constant_s)
+    decay_factor = np.exp(-interval_s / time_constant_s)
     filtered_m, _ = lfilter(
-        [1.0 - decay], [1.0, -decay], position_m, axis=0, zi=decay * position_m[:1]
+        [1.0 - decay_factor],
+        [1.0, -decay_factor],
+        position_m,
+        axis=0,
+        zi=decay_factor * position_m[:1],
     )
     return np.asarray(filtered_m)
 
