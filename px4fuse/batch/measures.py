@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from px4fuse.batch.rows import read_rows, value_at
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import Clock
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
@@ -55,7 +55,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
             record_path, _, field = path.rpartition(".")
             record, first_name = value_at(results, record_path), names[0] if names else ""
             value = getattr(record, field, None)
-            is_undetermined = isinstance(record, Clock) and not record.is_determinable
+            is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = pattern.startswith("aids.") and first_name in source_aids
             if pattern == "axes.*.rejected_fraction":

@@ -131,8 +131,8 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
-            estimate=score.estimate.track(),
-            reference=score.reference.track(),
+            estimate=score.estimate_track.track(),
+            reference=score.reference_track.track(),
             provenance=provenance(command_line(request)),
             **msgspec.structs.asdict(to_serializable(score)),
         )

@@ -13,26 +13,26 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.card.model import Card
-from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.replay import Agreement, Replayed
-from px4fuse.ekf2.steps import DifferenceSteps
+from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.time_offset import Clock
-from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight.log import ClockMap, InputFile, LogInfo
 from px4fuse.flight.model import Alignment
 from px4fuse.flight.position_source import DataPath, PositionKind
-from px4fuse.loop.model import LoopResult
+from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
-from px4fuse.trajectory.evaluation import Score
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import Graph
 from px4fuse.trajectory.model import Track
 
@@ -98,7 +98,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of NoiseEstimate with the maximum-likelihood estimate of a KF setting
+# Field of AxisTuning with the maximum-likelihood estimate of a KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
@@ -165,13 +165,13 @@ class ComparisonResults(_FlightResults, frozen=True):
 
     Attributes
     ----------
-    tuning : mapping of axis name to NoiseEstimate
+    tuning : mapping of axis name to AxisTuning
         "horizontal" stands for north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
-    ekf2_replay : Replayed
+    ekf2_replay : Ekf2Replay
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
-    difference_steps : mapping of axis name to DifferenceSteps
+    difference_steps : mapping of axis name to DifferenceExplanation
         Difference KF - EKF2 while the settings of KF are replaced by those of EKF2 one at a time.
     trials : tuple of Trial
         Re-runs of both filters, each with one change.
@@ -182,16 +182,16 @@ class ComparisonResults(_FlightResults, frozen=True):
         attitude.
     """
 
-    axes: Annotated[dict[AxisName, AxisResult], Meta(min_length=1)]
+    axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
     horizontal: dict[FilterName, HorizontalNis]
-    tuning: dict[str, OrUnavailable[NoiseEstimate]]
-    clock: OrUnavailable[Clock]
+    tuning: dict[str, OrUnavailable[AxisTuning]]
+    clock: OrUnavailable[ClockOffset]
     heading: OrUnavailable[HeadingError]
-    ekf2_replay: OrUnavailable[Replayed]
-    difference_steps: dict[str, OrUnavailable[DifferenceSteps]]
+    ekf2_replay: OrUnavailable[Ekf2Replay]
+    difference_steps: dict[str, OrUnavailable[DifferenceExplanation]]
     trials: tuple[Trial, ...]
     aids: dict[str, AidResult]
-    loop: OrUnavailable[LoopResult]
+    loop: OrUnavailable[Loop]
     card: Card
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -218,14 +218,14 @@ class AidsResults(Record, frozen=True):
 class TuningResults(_FlightResults, frozen=True):
     """Results of ``px4fuse tune``: maximum-likelihood estimates of the noises, by axis."""
 
-    tuning: dict[str, OrUnavailable[NoiseEstimate]]
+    tuning: dict[str, OrUnavailable[AxisTuning]]
     provenance: Provenance
 
 
 class SyncResults(_FlightResults, frozen=True):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
-    clock: OrUnavailable[Clock]
+    clock: OrUnavailable[ClockOffset]
     provenance: Provenance
 
 
@@ -236,7 +236,7 @@ class LoopResults(Record, frozen=True):
     request: LoopRequest
     track: Track
     references: tuple[Track, ...]
-    loop: LoopResult
+    loop: Loop
     findings: tuple[Finding, ...]
     student: Student
     provenance: Provenance
@@ -250,7 +250,7 @@ class GraphResults(Record, frozen=True):
     provenance: Provenance
 
 
-class EvaluationResults(Score, frozen=True, kw_only=True):
+class EvaluationResults(Evaluation, frozen=True, kw_only=True):
     """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
 
     schema: Schema
@@ -327,7 +327,9 @@ def schema() -> dict[str, Any]:
     kinds: dict[type, None] = dict.fromkeys(RESULTS_BY_SCHEMA.values())
     components: dict[str, Any] = {}
 
-    def describe_union(kind: Any) -> dict[str, Any]:
+    def describe(kind: Any) -> dict[str, Any]:
+        if kind is msgspec.UnsetType:  # a field that is not written
+            return {"not": {}}
         kinds.update(dict.fromkeys(kind.union_members))
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
@@ -336,7 +338,7 @@ def schema() -> dict[str, Any]:
     while count < len(kinds):
         count = len(kinds)
         _, components = msgspec.json.schema_components(
-            list(kinds), schema_hook=describe_union, ref_template="#/$defs/{name}"
+            list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
         )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

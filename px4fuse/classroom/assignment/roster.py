@@ -25,7 +25,7 @@ RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
 }
 ROSTER_COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # Fields of a student that are copied from another list if the class list does not contain them
-ADDED_FIELDS = ("name", "email", "login", "submitted")
+ADDED_FIELDS = ("name", "email", "login", "submitted", "extended_due")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
@@ -35,7 +35,8 @@ class Person:
     """Student of the class.
 
     ``login`` is the login on Blackboard or ILIAS, ``numbers`` the student's number by learning
-    platform, and ``submitted`` the submission time in Moodle's worksheet.
+    platform, ``submitted`` the submission time in Moodle's worksheet, and ``extended_due`` the due
+    time of this student in the form of the option --due.
     """
 
     student_id: str
@@ -44,6 +45,7 @@ class Person:
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
     submitted: str = ""
+    extended_due: str = ""
 
     @property
     def file(self) -> str:
@@ -128,7 +130,15 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
     submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
-    person = Person(student_id, name, cells["email"], cells["login"], numbers, submission_time)
+    person = Person(
+        student_id,
+        name,
+        cells["email"],
+        cells["login"],
+        numbers,
+        submission_time,
+        cells["extended_due"],
+    )
     return person if student_id or name or numbers else None
 
 

@@ -21,9 +21,9 @@ from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import OrUnavailable, Share
 from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
 from px4fuse.filter.consistency import HorizontalNis
-from px4fuse.filter.time_offset import Clock
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.loop.model import Correction, CorrectionName, LoopResult
+from px4fuse.loop.model import CorrectedPath, CorrectionName, Loop
 from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
     TUNED_FIELDS,
@@ -31,7 +31,7 @@ from px4fuse.results.contract import (
     ReportedResults,
     to_plain,
 )
-from px4fuse.trajectory.evaluation import Score
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
@@ -361,7 +361,7 @@ def _largest_source_error_m(comparison: ComparisonResults) -> float:
     """Return the largest position RMSE or loop closure error (m) of KF; 0 without both."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
-    if isinstance(comparison.loop, LoopResult):
+    if isinstance(comparison.loop, Loop):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)
 
@@ -421,8 +421,8 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         clock = check_input.comparison.clock
-        if not isinstance(clock, Clock) or not clock.is_determinable:
-            fraction = self.undeterminable if isinstance(clock, Clock) else 0.0
+        if not isinstance(clock, ClockOffset) or not clock.is_determinable:
+            fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
             # the student could not choose the flight if the log was assigned
@@ -468,7 +468,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         loop = check_input.results.loop
-        closures = loop.closures if isinstance(loop, LoopResult) else ()
+        closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
         answer = check_input.answer
         landing_distance_m = answer.truth.get("closure_error_m", 0.0) if answer else 0.0
@@ -477,8 +477,8 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
                 f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
                 "so it is right that no loop closure was accepted."
             )
-        if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
-            unavailable = loop.true_end if isinstance(loop, LoopResult) else loop
+        if not isinstance(loop, Loop) or loop.closure_error_m is None:
+            unavailable = loop.true_end if isinstance(loop, Loop) else loop
             reason_text = format_reason(getattr(unavailable, "reason", ""))
             return 0.0, f"Your report contains no loop closure error{reason_text}."
         if loop.is_absolute_track:
@@ -497,7 +497,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
 
 
 def _score_corrections(
-    corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
+    corrections: Mapping[CorrectionName, OrUnavailable[CorrectedPath]],
 ) -> FractionAndReason:
     """Score conditions 3 and 4 of :class:`LoopItem`: 0.25 for each."""
     correction_names: tuple[CorrectionName, ...] = (
@@ -506,7 +506,7 @@ def _score_corrections(
         "pose_graph_gated",
     )
     paths = map(corrections.get, correction_names)
-    corrected_paths = [path for path in paths if isinstance(path, Correction)]
+    corrected_paths = [path for path in paths if isinstance(path, CorrectedPath)]
     if not corrected_paths:
         return 0.0, "The path was not corrected."
     ate_before_m = _ate_by_reference(corrections.get("uncorrected"))
@@ -530,9 +530,9 @@ def _score_corrections(
 
 def _ate_by_reference(correction: object) -> dict[str, float]:
     """Return the ATE (m) of a corrected path against each reference trajectory."""
-    scores = correction.scores if isinstance(correction, Correction) else {}
+    scores = correction.scores if isinstance(correction, CorrectedPath) else {}
     return {
         name: score.ate.translation_m.rmse
         for name, score in scores.items()
-        if isinstance(score, Score)
+        if isinstance(score, Evaluation)
     }

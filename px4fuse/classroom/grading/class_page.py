@@ -6,18 +6,16 @@ redrawn PDFs in the folder ``reports/`` beside it.
 
 import math
 import statistics
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from px4fuse.classroom.assignment.sheet import format_cell_number
+from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Entry,
-    GradedReport,
-    Item,
     Override,
     list_titles,
 )
@@ -86,23 +84,8 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=list(_item_statistics(reports)),
+        items=[(each, count_tenths(each.fractions, 1.0)) for each in analyse_items(reports)],
     )
-
-
-def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
-    """Yield title, distribution, mean and maximum of the points for each rubric item."""
-    items_by_title: dict[str, list[Item]] = defaultdict(list)
-    for report in reports:
-        for item in () if report.instructor_action else report.items:
-            items_by_title[item.title].append(item)
-    for title, items in items_by_title.items():
-        fractions = [item.points / item.max_points if item.max_points else 0.0 for item in items]
-        mean = statistics.fmean(item.points for item in items)
-        max_text = format_cell_number(max(item.max_points for item in items))
-        zero_count = sum(fraction <= 0.0 for fraction in fractions)
-        full_count = sum(fraction >= 1.0 for fraction in fractions)
-        yield title, count_tenths(fractions, 1.0), mean, max_text, zero_count, full_count
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, tzinfo
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -91,6 +91,12 @@ class Course:
         Title of the grade column in the worksheets; "" if each has only one grade column.
     attempt : {"latest", "best", "first"}
         Report of a student that counts.
+    grace_s : float
+        Maximum delay (s) without a deduction.
+    scale : float or None
+        Maximum points on the learning platform; None to enter the points of the rubric.
+    question_count : int
+        Number of questions per student for an oral check.
     include_pending : bool
         True to count the points of reports on which the instructor still has to decide.
     anonymous : bool
@@ -106,6 +112,9 @@ class Course:
     column: str = ""
     attempt: Literal["latest", "best", "first"] = "latest"
     due: datetime | None = None
+    grace_s: float = 0.0
+    scale: float | None = None
+    question_count: int = 0
     late_rule: LateRule | None = None
     include_pending: bool = False
     anonymous: bool = False
@@ -215,9 +224,13 @@ def _make_attempt(
     register: Register,
 ) -> Attempt:
     """Make the row of the class table that has this report as the only report of the student."""
-    origin, due_time = submission.origin, course.due
-    platform = origin.platform.capitalize()
+    origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
+    due_time = course.due
+    if due_time is not None and person.extended_due:
+        due_time = parse_due_time(
+            person.extended_due, f"extension of {one_line(person.student_id, 40)}:", due_time.tzinfo
+        )
     stated_time = origin.time or parse_moodle_time(person.submitted)
     time, zip_time = (
         time and add_time_zone(time, due_time) for time in (stated_time, submission.time)
@@ -225,7 +238,8 @@ def _make_attempt(
     late_s, flags = None, []
     if due_time is not None and time is not None:
         # UNIX times, because differences of datetimes ignore daylight saving within a time zone
-        late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
+        late_s = time.timestamp() - due_time.timestamp()
+        late_s = late_s if late_s > course.grace_s else 0.0
     elif origin.is_late:
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
@@ -464,10 +478,11 @@ def parse_late_rule(text: str) -> LateRule:
     return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction)
 
 
-def parse_due_time(text: str) -> datetime:
+def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
-    The default time zone is that of this computer. A date without a time means the end of the day,
+    ``name`` is the name of the time in errors. The default time zone is ``default_zone``, else that
+    of this computer. A date without a time means the end of the day,
     and a time without seconds the end of the minute.
 
     Raises
@@ -477,11 +492,11 @@ def parse_due_time(text: str) -> datetime:
     """
     words = text.split()
     try:
-        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
+        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_zone
         time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
-            f"--due {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
+            f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
     time_of_day = re.search(r"\d\d:\d\d(:\d\d)?", text)
@@ -489,7 +504,9 @@ def parse_due_time(text: str) -> datetime:
         time = time.replace(hour=23, minute=59)
     if time_of_day is None or time_of_day[1] is None:
         time = time.replace(second=59)
-    return time.replace(tzinfo=zone) if zone else time if time.tzinfo else time.astimezone()
+    if time.tzinfo is not None:
+        return time
+    return time.replace(tzinfo=zone) if zone else time.astimezone()
 
 
 def add_time_zone(time: datetime, due: datetime | None) -> datetime:

@@ -143,7 +143,7 @@ def _mistake_feedback(
         yield f"your flight has no injected fault{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
-        right_answer = _describe_right_answer(mistake)
+        right_answer = describe_right_answer(mistake)
         if student_mistake is None:
             yield f"you did not name {mistake_text}: {right_answer}"
         elif student_mistake.kind != mistake.kind:
@@ -155,7 +155,7 @@ def _mistake_feedback(
         yield f"you named faults that your flight does not have: {kinds}"
 
 
-def _describe_right_answer(mistake: TrueMistake) -> str:
+def describe_right_answer(mistake: TrueMistake) -> str:
     """State the accepted size, the time and the panels of the report that show the fault."""
     texts = []
     if mistake.low is not None and mistake.high is not None:

@@ -101,6 +101,8 @@ class GradedReport:
         Version of px4fuse that made the report.
     mistakes : mapping
         True for each injected fault of the assigned flight that the answer form names.
+    form_parts : tuple of Item
+        Points for each part of the answer form, of 100 points in total.
     redrawn_path : str
         Path of the PDF that px4fuse drew again from the log, relative to the class page.
     """
@@ -119,6 +121,7 @@ class GradedReport:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
+    form_parts: tuple[Item, ...] = ()
     redrawn_path: str = ""
 
     @property

@@ -38,7 +38,9 @@ from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import html_text
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
+from px4fuse.classroom.grading.item_analysis import TITLES, analyse_items
 from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.spreadsheet import neutralise_formulas, neutralise_id
@@ -52,6 +54,7 @@ REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 NAMES_FILE = "names.csv"
+QUESTIONS_FILE = "questions.txt"
 NAMES_TITLES = ("pseudonym", "id", "name")
 # Columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
@@ -118,12 +121,20 @@ def write_class(
         entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
     )
     feedback_texts = [feedback_text(entry, title) for entry in entries]
-    contents = {"class.csv": csv_text(entries).encode()}
+    reports = [report for entry in entries if (report := entry.counted_report)]
+    item_rows = tuple(tuple(map(neutralise_formulas, i.row)) for i in analyse_items(reports))
+    contents = {
+        "class.csv": csv_text(entries).encode(),
+        "items.csv": ("\ufeff" + Sheet(Path(), TITLES, item_rows).text).encode(),
+    }
     if course.anonymous:
         page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
         contents[NAMES_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = html_text(page_entries, title, made_with).encode()
+    if course.question_count and course.key is not None:
+        text = questions_text(entries, course.key, course.question_count)
+        contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
     for stem, text in zip(stems, feedback_texts, strict=True):
@@ -132,12 +143,19 @@ def write_class(
     names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, entries, course.register, course.column, feedback_texts
+            sheet, entries, course.register, course.column, feedback_texts, course.scale
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    outputs = ["class.csv", "class.html", *[REPORTS_FOLDER] * has_redrawn, FEEDBACK_FOLDER]
+    outputs = [
+        "class.csv",
+        "items.csv",
+        "class.html",
+        *[REPORTS_FOLDER] * has_redrawn,
+        FEEDBACK_FOLDER,
+        *[QUESTIONS_FILE] * (QUESTIONS_FILE in contents),
+    ]
     outputs += [GRADES_FOLDER] * bool(course.worksheets) + [OVERRIDES_NAME]
     return tuple(output / name for name in outputs), tuple(notes)
 
@@ -212,6 +230,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             form=report.form,
             numbers=report.numbers,
             mistakes=report.mistakes,
+            form_parts=report.form_parts,
         )
     return Entry(
         pseudonym,
@@ -341,7 +360,12 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 
 
 def fill_grades(
-    sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
+    sheet: Sheet,
+    entries: Sequence[Entry],
+    register: Register,
+    column: str,
+    feedback: Sequence[str],
+    scale: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
@@ -367,14 +391,17 @@ def fill_grades(
         if student_index is None:
             continue
         found_people.add(student_index)
-        total = entries[student_index].total
+        total, rubric_maximum = entries[student_index].total, entries[student_index].max_points
         if total is None:
             continue
+        if scale is not None and rubric_maximum:
+            total = round(total * scale / rubric_maximum, 2)
         max_points = _max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
-                f"maximum of {max_points:.10g} on the platform. Increase the maximum there."
+                f"maximum of {max_points:.10g} on the platform. Increase the maximum there, or run "
+                f"grade again with --scale {max_points:.10g}."
             )
         row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
         if feedback_index is not None and feedback_index != grade_index:

@@ -26,6 +26,7 @@ from px4fuse.classroom.grading.checks import (
     shorten_text,
 )
 from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.form_points import FormPoints
 from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, Item
 from px4fuse.core.reading import read_text
 from px4fuse.core.text import one_line
@@ -157,6 +158,8 @@ def score_report(
             Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
         )
     form_result, values = check_input.form_points, check_input.values
+    if isinstance(form_result, str) or not check_input.is_own_log:
+        form_result = FormPoints({}, {})
     return GradedReport(
         "",
         student.name,
@@ -170,9 +173,12 @@ def score_report(
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=rule_text if points_rule == "pending" else "",
-        mistakes={}
-        if isinstance(form_result, str) or not check_input.is_own_log
-        else form_result.is_kind_named,
+        mistakes=form_result.is_kind_named,
+        form_parts=tuple(
+            Item(name, form_result.points_by_part[name], max_points, "")
+            for name, max_points in form_result.max_points_by_part.items()
+            if max_points
+        ),
         form=check_input.form if isinstance(check_input.form, Answers) else None,
         numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
         log_sha256=log_sha256(results),
