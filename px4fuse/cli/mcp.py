@@ -4,6 +4,7 @@ import gc
 import io
 import json
 import os
+import signal
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -15,12 +16,12 @@ from typing import Any, get_args
 
 import click
 
-from px4fuse.cli import COMMANDS, cli, options, outputs
+from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
 from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
 from px4fuse.errors import SettingsError
 
-# Names of arguments of tools that differ from those of the command line
-ARGUMENT_NAMES = {"finding": "finding_id", "set": "parameters", "source": "log"}
+# Names of arguments of tools that differ from the names of the parameters of commands
+ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
 # Parameters of commands that are no arguments of tools: outputs, exit codes and the student
 HIDDEN = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
@@ -57,18 +58,22 @@ def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: 
         raise SettingsError(
             "px4fuse mcp requires the package mcp.", 'Run pip install "px4fuse[mcp]".'
         )
-    import anyio
-
-    from px4fuse.mcp.server import make_server, serve
+    from px4fuse.mcp.server import Server
 
     gc.enable()  # the server runs for a long time
+    for signal_number in TERMINATION_SIGNALS:
+        # no exception, because the thread that reads standard input would not end
+        signal.signal(signal_number, lambda number, _: os._exit(128 + number))
     folders = tuple(root.resolve() for root in roots)
     if out is not None:
         out = out.resolve()
         out.mkdir(parents=True, exist_ok=True)
     run = partial(run_command, folders, max_log_bytes.get(), out)
-    server = make_server(make_tools(folders, out), run, timeout_s, int(memory_gb * 1e9))
-    anyio.run(serve, server)
+    server = Server(make_tools(folders), run, timeout_s, int(memory_gb * 1e9))
+    try:
+        server.run()
+    except* BrokenPipeError:  # the client has ended
+        pass
 
 
 def run_command(
@@ -95,15 +100,16 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    if out is not None and sender is not None:  # the server itself writes nothing
+    if out and sender:  # the server itself writes nothing
         os.chdir(out)
     text, results = io.StringIO(), list[str]()
     try:
         with redirect_stdout(text), redirect_stderr(io.StringIO()):
-            context = cli.make_context("px4fuse", [*words])
-            context.meta[outputs.SEND_KEY] = None if sender is None else sender.send
-            context.meta[outputs.RESULTS_KEY] = results
-            with context:
+            # with "-" the command makes no report
+            defaults = {words[0]: {"json_path": None if out else "-"}}
+            with cli.make_context("px4fuse", [*words], default_map=defaults) as context:
+                context.meta[outputs.SEND_KEY] = sender and sender.send
+                context.meta[outputs.RESULTS_KEY] = results
                 cli.invoke(context)
     except click.UsageError as error:
         raise SettingsError(error.format_message()) from error
@@ -113,10 +119,15 @@ def run_command(
     return text.getvalue(), data["card"] if words[0] == "compare" else data
 
 
-def make_tools(folders: tuple[Path, ...], out: Path | None) -> dict[str, Any]:
-    """Make the tools of the server from the parameters of the commands and the results types."""
+def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
+    """Return the tools of the server, and for each the function that parses its arguments.
+
+    The input schemas are made from the options of the commands, the output schemas from the types
+    of the results.
+    """
+    from mcp.types import Tool
+
     from px4fuse.card.model import Card
-    from px4fuse.mcp.server import Tool
     from px4fuse.results import contract
 
     # command and type of the results by name of the tool
@@ -131,42 +142,36 @@ def make_tools(folders: tuple[Path, ...], out: Path | None) -> dict[str, Any]:
         "explain": ("explain", None),
         "list_findings": ("explain", None),
     }
-    tools = {}
+    tools = list[tuple[Any, Any]]()
     for name, (command_name, kind) in kinds.items():
         command = cli.get_command(click.Context(cli), command_name)
-        assert command is not None
-        parameters = {} if name == "list_findings" else _parameters_by_argument(command)
+        parameters = {
+            ARGUMENT_NAMES.get(parameter.name or "", parameter.name or ""): parameter
+            for parameter in (command.params if command and name != "list_findings" else ())
+            if parameter.expose_value and parameter.name not in HIDDEN
+        }
+        input_schema = {
+            "type": "object",
+            "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
+            "required": [
+                name
+                for name, parameter in parameters.items()
+                if isinstance(parameter, click.Argument)
+            ],
+            "additionalProperties": False,
+        }
         output_schema = None
         if kind is not None:
             schemas, definitions = contract.schema_of_types(get_args(kind) or (kind,))
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
-        tools[name] = Tool(
-            COMMANDS[command_name] if parameters else "List the id and title of each finding.",
-            _input_schema(parameters),
-            output_schema,
-            partial(_parse, command, parameters, folders, has_report=out is not None),
+        tool = Tool(
+            name=name,
+            description=COMMANDS[command_name] if parameters else "List the ids of all findings.",
+            input_schema=input_schema,
+            output_schema=output_schema,
         )
+        tools.append((tool, partial(_parse, command_name, parameters, folders)))
     return tools
-
-
-def _parameters_by_argument(command: click.Command) -> dict[str, click.Parameter]:
-    names = {
-        parameter: parameter.opts[-1].lstrip("-").replace("-", "_")
-        for parameter in command.params
-        if parameter.expose_value and parameter.name not in HIDDEN
-    }
-    return {ARGUMENT_NAMES.get(name, name): parameter for parameter, name in names.items()}
-
-
-def _input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
-    return {
-        "type": "object",
-        "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
-        "required": [
-            name for name, parameter in parameters.items() if isinstance(parameter, click.Argument)
-        ],
-        "additionalProperties": False,
-    }
 
 
 def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
@@ -183,18 +188,14 @@ def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
         return {"type": "object", "additionalProperties": {"type": "number"}}
     if parameter.multiple:
         schema = {"type": "array", "items": schema}
-    is_file = isinstance(kind, options.InputPath)
-    help_text = "Path relative to --root." if is_file else ""
-    return schema | {"description": getattr(parameter, "help", None) or help_text}
+    return schema | {"description": getattr(parameter, "help", None) or ""}
 
 
 def _parse(
-    command: click.Command,
+    command_name: str,
     parameters: Mapping[str, click.Parameter],
     folders: Sequence[Path],
     arguments: Mapping[str, Any],
-    *,
-    has_report: bool,
 ) -> tuple[list[str], list[Path]]:
     """Return the command line of a tool call, and its input files.
 
@@ -203,11 +204,11 @@ def _parse(
     LogError
         A file is outside the folders.
     """
-    words, operands, files = [command.name or ""], list[str](), list[Path]()
+    words, operands, files = [command_name], ["--"], list[Path]()
     for name, parameter in parameters.items():
         if name not in arguments:
             continue
-        value = arguments[name]
+        value, option = arguments[name], parameter.opts[-1]
         if isinstance(value, dict):
             value = [f"{key}={number}" for key, number in value.items()]
         texts = [str(text) for text in (value if isinstance(value, list) else [value])]
@@ -217,13 +218,10 @@ def _parse(
         if isinstance(parameter, click.Argument):
             operands += texts
         elif isinstance(value, bool):
-            words += [parameter.opts[-1]] * value
+            words += [option] * value
         else:
-            words += [f"{parameter.opts[-1]}={text}" for text in texts]
-    names = {parameter.name for parameter in command.params}
-    if "json_path" in names and not (has_report and "output" in names):
-        words.append("--json=-")
-    return [*words, "--", *operands], files
+            words += [f"{option}={text}" for text in texts]
+    return words + operands, files
 
 
 def _find_file(text: str, folders: Sequence[Path]) -> str:
