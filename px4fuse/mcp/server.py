@@ -93,8 +93,7 @@ class Server(MCPServer[Any]):
                 f"findings/{name}", title, "text/plain", partial(self._explain, name)
             )
         for name, prompt in TEXTS.prompts.items():
-            messages = partial(_messages, prompt.text)
-            self.add_prompt(Prompt.from_function(messages, name, prompt.title, prompt.title))
+            self.add_prompt(_make_prompt(name, prompt))
 
     async def list_tools(self) -> list[Tool]:
         return [tool for tool, _ in self._tools.values()]
@@ -160,8 +159,11 @@ class Server(MCPServer[Any]):
         return self._run(None, ["explain", finding_id])[0]
 
 
-def _messages(text: str, log: str) -> list[str]:
-    return [text, log]
+def _make_prompt(name: str, prompt: PromptText) -> Prompt:
+    def messages(log: str) -> list[str]:
+        return [prompt.text, log]
+
+    return Prompt.from_function(messages, name, prompt.title, prompt.title)
 
 
 def _format_schema() -> str:
