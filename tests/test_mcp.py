@@ -17,7 +17,7 @@ import jsonschema
 import psutil
 import pytest
 from batch_tools import tiny_log
-from cli_tools import error_line, run_checked
+from cli_tools import error_line
 from conftest import REPOSITORY, SAMPLES
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters
@@ -100,12 +100,15 @@ def test_server_lists_tools_with_valid_schemas(tmp_path: Path) -> None:
     async def talk(client: Client) -> None:
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         assert list(tools) == list(ARGUMENTS)
+        counts: dict[str, int] = {}
         for name, tool in tools.items():
             jsonschema.Draft202012Validator.check_schema(tool.input_schema)
             jsonschema.validate(ARGUMENTS[name], tool.input_schema)
             if tool.output_schema is not None:
                 jsonschema.Draft202012Validator.check_schema(tool.output_schema)
                 assert tool.output_schema["type"] == "object"
+                counts[name] = len(tool.output_schema["anyOf"])
+        assert counts == {**dict.fromkeys(COMMANDS, 1), "close_loop": 2}
         properties = tools["diagnose"].input_schema["properties"]
         assert {"log", "sigma_z_m", "axes", "position", "verbose"} <= properties.keys()
         assert not {"output", "json_path", "student", "fail_on"} & properties.keys()
@@ -211,15 +214,20 @@ def test_mcp_without_its_package_states_how_to_install(monkeypatch: pytest.Monke
 # -- analyses in a server process ------------------------------------------------------------------
 
 
+def printed(*words: str | Path) -> dict[str, Any]:
+    """Return the results (JSON) of a command in a process of its own."""
+    command = [sys.executable, "-m", "px4fuse", *map(str, words), "--json", "-"]
+    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+
+
 def results_of(tool: str) -> dict[str, Any]:
     """Return the results (JSON) that the command of a tool prints."""
     paths = {"log": "aisle_uwb.ulg", "vio": "loop_vio.ulg", "slam": "loop_slam.tum"}
     words = COMMANDS[tool].format(**{name: SAMPLES / file for name, file in paths.items()})
-    return json.loads(run_checked(*words.split(), "--json", "-").stdout)
+    return printed(*words.split())
 
 
 @pytest.mark.process
-@pytest.mark.usefixtures("cached_analyses")
 def test_each_tool_returns_the_results_of_its_command() -> None:
     """The client validates each result with the output schema of the server."""
     activities: list[str | None] = []
@@ -251,8 +259,7 @@ def test_each_tool_returns_the_results_of_its_command() -> None:
             assert not activities
         for file in ("aisle_uwb.tlog", "loop_vio.ulg"):
             answer = await client.call_tool("diagnose", {"log": file})
-            printed = run_checked("compare", SAMPLES / file, "--json", "-").stdout
-            assert answer.structured_content == json.loads(printed)["card"]
+            assert answer.structured_content == printed("compare", SAMPLES / file)["card"]
 
     connect(started(), talk)
 
@@ -377,8 +384,7 @@ def test_server_withholds_diagnosis_of_assigned_flight(tmp_path: Path) -> None:
 
     async def talk(client: Client) -> None:
         answer = await client.call_tool("diagnose", {"log": "s01.ulg"})
-        printed = run_checked("compare", tmp_path / "s01.ulg", "--json", "-").stdout
-        assert answer.structured_content == json.loads(printed)["card"]
+        assert answer.structured_content == printed("compare", tmp_path / "s01.ulg")["card"]
         assert answer.structured_content.get("causes", []) == []
         for tool in ("estimate_noise", "estimate_time_offset", "what_if"):
             refused = await client.call_tool(tool, {"log": "s01.ulg"})
@@ -436,7 +442,6 @@ def test_card_of_shared_logs_equals_card_of_compare(shared_logs: Path) -> None:
         await client.list_tools()
         for log in logs:
             answer = await client.call_tool("diagnose", {"log": str(log)})
-            printed = run_checked("compare", log, "--json", "-").stdout
-            assert answer.structured_content == json.loads(printed)["card"], log
+            assert answer.structured_content == printed("compare", log)["card"], log
 
     connect(started(folder=shared_logs), talk)
