@@ -39,9 +39,7 @@ def test_source_words_exist_for_each_kind_of_source() -> None:
 
 
 def test_findings_take_words_about_sensors_from_the_table() -> None:
-    pattern = re.compile(
-        r"\"[^\"]*(anchor|NLOS|line of sight|marker|reflection|multipath)", re.I
-    )
+    pattern = re.compile(r"\"[^\"]*(anchor|NLOS|line of sight|marker|reflection|multipath)", re.I)
     for file in FINDINGS.glob("*.py"):
         for line in file.read_text().splitlines():
             assert not pattern.search(line), (file.name, line)

@@ -75,9 +75,10 @@ class SourceWords(Record, frozen=True):
     errors_action: str
 
 
-SOURCE_WORDS: Mapping[PositionKind, SourceWords] = table(
-    __file__, "source_words.toml", dict[PositionKind, SourceWords]
-)
+_WORDS = table(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
+    kind: SourceWords(**(_WORDS["unknown"] | words)) for kind, words in _WORDS.items()
+}
 
 
 def source_words(source: PositionTrack) -> SourceWords:
