@@ -6,7 +6,7 @@ measured distance or ground truth.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pandas as pd
@@ -69,11 +69,15 @@ MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of one of many jumps without a change of reset_counter
 MIN_SMALL_JUMP_M = 0.1
 # Minimum size of such a jump in medians of the differences of successive steps
-MIN_STEP_RATIO = 12.0
+MIN_STEP_RATIO = 8.0
+# Number of differences for the median
+NOISE_SAMPLES = 61
 # Minimum number of steps between positions to find jumps
 MIN_JUMP_ROWS = 100
-# Maximum ratio of a difference beside a jump to that at the jump
-MAX_BESIDE_RATIO = 0.75
+# Minimum time (s) and minimum number of positions for which a jump lasts: outliers are shorter
+MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
+# Maximum difference between the jump and the shift of the median position, as fraction of the jump
+MAX_LASTING_RATIO = 0.5
 # Maximum interval at a jump in median intervals: during a gap the vehicle moves
 MAX_INTERVAL_RATIO = 1.5
 # Minimum fraction of jumps opposite to the previous one, for positions that alternate
@@ -139,7 +143,12 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    correlation = analysis.time_correlated_noise
+    clock, correlation = analysis.clock, analysis.time_correlated_noise
+    # with fast samples the correlation determines the lag badly, the time offset shows it directly
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > (latest_s := -clock.interval_s[0]):
+        low_pass = replace(low_pass, lag_s=max(-clock.offset_s, 0.0))
+        if latest_s < MIN_LAG_S:
+            return None
     # a low pass delays positions: correlated errors without a lag have another cause
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
         return None
@@ -303,17 +312,22 @@ def _unannounced_jumps(analysis: Analysis) -> list[tuple[float, Array]]:
     if len(steps_m) < MIN_JUMP_ROWS:
         return []
     excess_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
-    size_m = np.linalg.norm(excess_m, axis=1)
-    interval_s = np.diff(time_s)[1:-1]
-    limit_m = max(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * float(np.median(size_m)))
-    # the steps beside a jump differ by half its size, those of a single outlier by more
-    beside_m = np.maximum(np.roll(size_m, 1), np.roll(size_m, -1))
-    is_jump = (size_m > limit_m) & (beside_m < MAX_BESIDE_RATIO * size_m)
-    is_jump &= interval_s < MAX_INTERVAL_RATIO * np.median(interval_s)
-    rows = np.flatnonzero(is_jump)
-    lasts = np.diff(time_s[rows], prepend=-np.inf, append=np.inf)
-    rows = rows[(lasts[:-1] > OUTLIER_BURST_S) & (lasts[1:] > OUTLIER_BURST_S)]
-    return [(float(time_s[row + 2]), excess_m[row]) for row in rows]
+    size_m, interval_s = np.linalg.norm(excess_m, axis=1), np.diff(time_s)[1:-1]
+    usual_m = pd.Series(size_m).rolling(NOISE_SAMPLES, center=True, min_periods=1).median()
+    limit_m = np.maximum(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * usual_m.to_numpy())
+    is_jump = (size_m > limit_m) & (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s))
+    count = max(MIN_LASTING_SAMPLES, round(MIN_LASTING_S / float(np.median(interval_s))))
+    jumps = []
+    for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
+        before_m, after_m = (
+            position_m.iloc[max(row - count, 0) : row],
+            position_m.iloc[row:][:count],
+        )
+        around_m = steps_m[max(row - count, 0) : row + count]
+        lasting_m = after_m.median() - before_m.median() - count * np.median(around_m, axis=0)
+        if np.linalg.norm(lasting_m - excess_m[row - 2]) < MAX_LASTING_RATIO * size_m[row - 2]:
+            jumps.append((float(time_s[row]), excess_m[row - 2]))
+    return jumps
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
