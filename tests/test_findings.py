@@ -24,7 +24,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight.log import ClockMap, Dropout
-from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Ekf2, Flight, Reset, Unavailable
 from px4fuse.flight.position_source import ALIGNED
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest, PositionFile
@@ -315,6 +315,8 @@ CORRUPT_LOG = ("log_damaged", "imu_samples_missing")
 
 
 def parameter(comparison: Comparison, name: str) -> float:
+    if name == "EKF2_EVP_GATE" and isinstance(comparison.flight.ekf2, Ekf2):
+        return comparison.flight.ekf2.gate
     return comparison.flight.log.parameters.get(name, math.nan)
 
 

@@ -60,6 +60,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "autopilot_restarted",
     "imu_samples_missing",
     "ekf2_not_fusing",
+    "parameter_changed",
 )
 # Ids of findings that only repeat a verdict on σ; the card lists them only if no other cause exists
 VERDICT_FINDINGS = frozenset(

@@ -11,7 +11,7 @@ from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess
-from px4fuse.findings.model import Findings, fraction_on, note, warning
+from px4fuse.findings.model import Findings, format_percent, fraction_on, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
@@ -49,8 +49,8 @@ def detect(analysis: Analysis) -> Findings:
         if abs(new.fused_fraction - old.fused_fraction) > MIN_FUSING_CHANGE:
             has_effect = True
             effect += (
-                f" EKF2 fuses the positions {old.fused_fraction:.0%} of the time "
-                f"{since.format(f'{new.fused_fraction:.0%}')}."
+                f" EKF2 fuses the positions {format_percent(old.fused_fraction)} of the time "
+                f"{since.format(format_percent(new.fused_fraction))}."
             )
         elif old.verdict and new.verdict:
             has_effect = _differ(old.sigma_ratio, new.sigma_ratio)

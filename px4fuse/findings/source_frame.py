@@ -66,13 +66,15 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR
     ):
         detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
+    has_yaw = analysis.source.orientation is not None
     if detail:
         return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
         f"{fault} EKF2 did not fuse the yaw of {name}. The IMU is rotated into NED, so the axes of "
         "positions and IMU may differ.",
-        "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
+        "Send the position in NED"
+        + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
     )
 
 

@@ -57,6 +57,11 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
         "{positions} repeat the last position: the source has lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
     ),
+    "far": (
+        "source_without_position",
+        "{positions} are more than 10 km from the other positions: another origin, or no fix",
+        "",
+    ),
     "NaN": (
         "source_without_position",
         "{positions} are NaN: the source had no fix",

@@ -382,9 +382,13 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    If ``origin`` is None, the first sample is the origin.
+    If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
+    latitude and longitude 0: these samples become NaN.
     """
-    latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
+    global_positions = global_positions[GLOBAL_COLUMNS].mask(
+        (global_positions[GLOBAL_COLUMNS[:2]] == 0.0).all(axis=1)
+    )
+    latitude, longitude, altitude = global_positions.to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
     ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
