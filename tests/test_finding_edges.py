@@ -320,7 +320,7 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
     assert finding.remedy == (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"{SOURCE_WORDS['uwb'].errors_action}"
+        f"Then check {SOURCE_WORDS['uwb'].errors}."
     )
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
@@ -329,14 +329,14 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
             0.28,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"{SOURCE_WORDS['uwb'].errors_action}"
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
             ),
         ),
         (
             0.4,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"{SOURCE_WORDS['uwb'].errors_action}"
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
             ),
         ),
     ):

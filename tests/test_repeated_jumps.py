@@ -35,7 +35,7 @@ def test_unannounced_jumps_are_reported_with_their_pattern(shift_m, count, words
     (found,) = source_positions.detect_repeated_jumps(shifted(shift_m))
     assert found.evidence["count"] == pytest.approx(count, abs=2)
     assert words in found.message
-    assert "reset_counter does not announce" in found.message
+    assert "without a change of reset_counter" in found.message
 
 
 def test_single_outliers_are_not_reported_as_jumps() -> None:

@@ -148,7 +148,7 @@ def make_error_finding(
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden)
     remedy = (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"{source_words(analysis.source).errors_action}"
+        f"Then check {source_words(analysis.source).errors}."
     )
     if cause is not None:
         remedy = format_action(analysis, cause.change)

@@ -69,10 +69,9 @@ class SourceWords(Record, frozen=True):
     outliers_action: str
     reception: str
     noise: str
-    slow_errors_action: str
     unequal_axes_action: str
     scale: str
-    errors_action: str
+    errors: str
 
 
 _WORDS = table(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])

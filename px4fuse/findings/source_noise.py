@@ -78,7 +78,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
         "KF and EKF2 assume independent errors: they follow the correlated error and report a σ "
         "that is too small. Innovations do not show this error.",
-        source_words(analysis.source).slow_errors_action,
+        f"Check {source_words(analysis.source).errors}.",
         evidence,
     )
 

@@ -243,13 +243,9 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
     """Detect a source that jumps again and again: it corrects its drift, or measures two points."""
-    ekf2, reset_s = analysis.flight.ekf2, reset_times_s(analysis.source)
-    jumps = _announced_jumps(analysis, reset_s)
-    if is_announced := len(jumps) >= MIN_ANNOUNCED_JUMPS:
-        counter = "its reset_counter rises at each jump"
-    elif len(jumps := _unannounced_jumps(analysis)) >= MIN_UNANNOUNCED_JUMPS:
-        counter = "its reset_counter does not announce the jumps"
-    else:
+    ekf2 = analysis.flight.ekf2
+    jumps, is_announced = _find_jumps(analysis)
+    if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
         return
     times_s, steps_m = np.array([time_s for time_s, _ in jumps]), np.array([s for _, s in jumps])
     sizes_m = np.linalg.norm(steps_m, axis=1)
@@ -271,8 +267,10 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         )
     listed = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     returns = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    counter = "and its reset_counter rises at each jump"
     cause = "the source (VIO or SLAM) drifts and corrects its drift"
     if not is_announced:
+        counter = "without a change of reset_counter"
         cause = f"possible causes are {source_words(analysis.source).jump}"
     action = "Improve the tracking of the source, or correct the drift in smaller steps."
     if returns.mean() >= MIN_RETURNS:
@@ -280,39 +278,32 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         action = "Send the position of one point of the vehicle."
     yield error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and {counter}. The "
-        f"jumps are at {listed} s, every {np.median(np.diff(times_s)):.0f} s: {cause}.{effect}",
+        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter}. The jumps "
+        f"are at {listed} s, every {np.median(np.diff(times_s)):.0f} s: {cause}.{effect}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
         zero_length_spans(times_s.tolist()),
     )
 
 
-def _announced_jumps(analysis: Analysis, reset_s: Array) -> list[tuple[float, Array]]:
-    """Return time (s) and step (m) of the jumps at which ``reset_counter`` changes."""
-    position_m = analysis.source.samples[Columns.POSITION[:2]].dropna()
-    time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
-    jumps = []
-    for at_s in reset_s:
-        row = int(np.searchsorted(time_s, at_s - RESET_TOLERANCE_S)) - 1
-        inside = analysis.segment.start_s < at_s < analysis.segment.end_s
-        if inside and 0 < row < len(steps_m) - 1:
-            step_m = steps_m[row] - 0.5 * (steps_m[row - 1] + steps_m[row + 1])
-            if np.linalg.norm(step_m) >= MIN_JUMP_M:
-                jumps.append((float(at_s), step_m))
-    return jumps
+def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
+    """Return time (s) and step (m) of the jumps, and True if ``reset_counter`` announces them.
 
-
-def _unannounced_jumps(analysis: Analysis) -> list[tuple[float, Array]]:
-    """Return time (s) and step (m) of lasting jumps that are far above the noise."""
+    Jumps that are not announced must last, and be far above the noise.
+    """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(steps_m) < MIN_JUMP_ROWS:
-        return []
+        return [], False
     excess_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
     size_m, interval_s = np.linalg.norm(excess_m, axis=1), np.diff(time_s)[1:-1]
+    resets = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
+    resets = resets[(resets >= 0) & (resets < len(size_m))]
+    resets = resets[size_m[resets] >= MIN_JUMP_M]
+    if len(resets) >= MIN_ANNOUNCED_JUMPS:
+        return [(float(time_s[row + 2]), excess_m[row]) for row in resets], True
     usual_m = pd.Series(size_m).rolling(NOISE_SAMPLES, center=True, min_periods=1).median()
     limit_m = np.maximum(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * usual_m.to_numpy())
     is_jump = (size_m > limit_m) & (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s))
@@ -327,7 +318,7 @@ def _unannounced_jumps(analysis: Analysis) -> list[tuple[float, Array]]:
         lasting_m = after_m.median() - before_m.median() - count * np.median(around_m, axis=0)
         if np.linalg.norm(lasting_m - excess_m[row - 2]) < MAX_LASTING_RATIO * size_m[row - 2]:
             jumps.append((float(time_s[row]), excess_m[row - 2]))
-    return jumps
+    return jumps, False
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
