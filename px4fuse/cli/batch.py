@@ -15,7 +15,7 @@ from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
 
 FAILED_STATUS = "failed"
-# Types of clusters for which px4fuse prints instructions (NAME.txt in this folder)
+# Values of --scheduler for which px4fuse prints the instructions in NAME.txt
 CLUSTERS = ("slurm", "kubernetes")
 
 
@@ -61,7 +61,7 @@ def batch(
         click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
         return
     if output is None:
-        raise SettingsError("batch requires an output folder: -o DIR.")
+        raise SettingsError("px4fuse batch requires an output folder: -o DIR.")
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.batch.run import run

@@ -38,11 +38,6 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-def parse_columns(text: str) -> tuple[str, ...]:
-    """Parse comma-separated column names, or column numbers, of a position file."""
-    return tuple(text.split(","))
-
-
 Option = Callable[[Callable[..., None]], Callable[..., None]]
 Choice = partial(click.Choice, case_sensitive=False)
 
@@ -190,7 +185,6 @@ def report_options(text: str) -> Option:
 
 
 def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    """Declare --fail-on: exit code 1 on a finding of a severity."""
     return click.option("--fail-on", type=Choice(severities), help=text)
 
 
@@ -266,7 +260,7 @@ position_options = _combine_options(
     ),
     click.option(
         "--position-columns",
-        type=parse_columns,
+        type=lambda names: tuple(names.split(",")),
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of the columns of the position file; SIGMA is the standard "
         "deviation of the position.  [default: detected from the names]",

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name, because file systems allow 255; of a longer name
-# the first KEPT_STEM_BYTES bytes are used
+# Maximum length (bytes) of a default report name: file systems allow 255. A longer name is cut to
+# KEPT_STEM_BYTES
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id of the student in a report without a student
 NO_STUDENT_NAME = ("", "")
@@ -44,7 +44,7 @@ OPENS_OUTPUT_KEY = "px4fuse.opens_output"
 SEND_KEY, RESULTS_KEY = "px4fuse.send", "px4fuse.results"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
-# Element in the head of a web page with the command and the SHA-256 of its log
+# HTML element that contains the command and the SHA-256 of the log of a web page
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
@@ -251,7 +251,6 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """Format a sentence with the files that this run has written, for a run that ends early."""
     written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{written_before(written_files)}." if written_files else "nothing was written."
 
@@ -331,7 +330,6 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    """Print a page on standard output or, if it reports an error, on standard error."""
     from px4fuse.report.screen import show
 
     show(terminal(is_error=is_error), page.blocks)

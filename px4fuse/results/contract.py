@@ -98,7 +98,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning that contains the maximum-likelihood estimate, by KF setting
+# Field of AxisTuning with the maximum-likelihood estimate of a KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
