@@ -29,7 +29,7 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.log import WITHHELD
-from px4fuse.mcp.server import MAX_CACHED, NOTICE, TEXTS, Server
+from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED, NOTICE, PROMPTS, Server
 from px4fuse.results.contract import schema, to_json
 
 # Command of px4fuse for each tool that analyses a file
@@ -153,8 +153,8 @@ def test_prompt_contains_the_log_in_its_own_message(tmp_path: Path) -> None:
             assert [argument.name for argument in prompt.arguments or []] == ["log"]
             messages = (await client.get_prompt(prompt.name, {"log": hostile})).messages
             texts = [message.content.text for message in messages]
-            assert texts == [TEXTS.prompts[prompt.name].text, hostile]
-        assert client.instructions == TEXTS.instructions
+            assert texts == [PROMPTS[prompt.name]["text"], hostile]
+        assert client.instructions == INSTRUCTIONS
 
     connect(in_process(tmp_path), talk)
 
