@@ -89,7 +89,7 @@ def diagnose(
     flight : Flight, optional
         Flight from the files of the request; without it, the files are read.
     as_sent : bool
-        True to analyse the positions as sent, without the check of their axes, unit and clock.
+        True to skip the check of axes, unit and clock of the positions.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def diagnose(
 
 
 def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate noises and time offset, re-run both filters with changes, and find faults.
+    """Explain a comparison: estimate errors, re-run the filters without each error, find faults.
 
     Of a flight that is an assignment, only the comparison is returned.
     """
@@ -121,7 +121,7 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     convention, clock = comparison.convention, estimates.clock
     is_late = find_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
     if convention and is_late and isinstance(clock, ClockOffset) and clock.is_determinable:
-        # the estimate from corrected timestamps is more precise
+        # this maximum-likelihood estimate is more precise than the offset of the convention check
         convention = structs.replace(convention, late_s=-clock.offset_s)
         comparison = replace(comparison, convention=convention)
     reruns = intervene(comparison, estimates, progress)
@@ -211,7 +211,7 @@ def prepare_comparison(
 def intervene(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run both filters with changes."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run the filters without each error."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     model = open_model(
@@ -293,7 +293,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # EKF2 can be replayed without KF, too
+    except MissingDataError:  # only the default change needs the estimates of a comparison
         if is_default_change:
             raise
     if comparison is not None:

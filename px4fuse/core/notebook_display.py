@@ -12,11 +12,7 @@ MAX_TEXT_LENGTH = 60
 
 @singledispatch
 def display_html(result: object) -> str | None:
-    """Return a result as HTML for notebooks.
-
-    The module that formats a type registers a function for the type, because the module of the type
-    must not import it. Return None for other types, which notebooks show as text.
-    """
+    """Return a result as HTML for notebooks; None for types without a registered function."""
     return None
 
 

@@ -1,7 +1,6 @@
-"""Base class of the records in results: immutable, strictly typed, and written without change.
+"""Base class of the records in results, and :class:`Unavailable` for missing data.
 
-Field names contain the unit. If a number cannot be computed, the number is absent, or an
-:class:`Unavailable` replaces its record.
+Field names contain the unit.
 """
 
 from __future__ import annotations
@@ -79,10 +78,9 @@ else:
             return msgspec.UnsetType
 
     class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
+        """``RecordOrUnavailable[T, A]``: a record T, or an Unavailable of type A.
 
-        Each union is a separate type, which :func:`decode_record_or_unavailable` decodes, because
-        msgspec decodes unions of structs only if they have tags, and records have no tags.
+        msgspec itself decodes such a union only if both types have tags.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -101,13 +99,7 @@ else:
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable`, as ``dec_hook`` of msgspec.
-
-    Raises
-    ------
-    ValueError
-        The value is neither the record nor an Unavailable.
-    """
+    """Decode a :class:`RecordOrUnavailable` for msgspec (argument ``dec_hook``)."""
     record_type, unavailable_type = union_type.union_members
     kind = (
         unavailable_type

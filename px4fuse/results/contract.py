@@ -108,7 +108,7 @@ Interval = tuple[float, float | None]
 
 
 class DiffInput(Record, frozen=True, kw_only=True):
-    """Input A or B of ``px4fuse diff``: file that the user named, and log that it refers to."""
+    """Input A or B of ``px4fuse diff``: file name (``given``), and the log of its results."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -118,18 +118,10 @@ class DiffInput(Record, frozen=True, kw_only=True):
 
 
 class NumberChange(Record, frozen=True, kw_only=True):
-    """Numeric result that differs between the inputs A and B.
+    """Number that differs between the inputs A and B, with 95 % intervals if there are any.
 
-    Attributes
-    ----------
-    path : str
-        Path in the results: ``axes.aisle.filters.ekf2.nis_mean``.
-    label, unit : str
-        Name for the user, and unit ("share" for a fraction from 0 to 1).
-    a, b : float
-        Value in A and in B; absent if the results of that input do not contain the number.
-    a_interval, b_interval : (float, float or None)
-        95 % intervals; absent if the results contain none.
+    ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
+    "share" is a fraction from 0 to 1. ``a`` or ``b`` is absent if only one input has the number.
     """
 
     path: str
@@ -173,39 +165,18 @@ class ComparisonResults(_FlightResults, frozen=True):
 
     Attributes
     ----------
-    schema : Schema
-    request : ComparisonRequest
-        Files and settings of the analysis.
-    log : Log
-    source : PositionSource
-    settings : ChosenSettings
-    axes : mapping of axis name to AxisComparison
-    horizontal : mapping of "kf" and "ekf2" to HorizontalNis
-    tuning : mapping of axis name, or "horizontal" for north and east together, to AxisTuning
-    clock : ClockOffset
+    tuning : mapping of axis name to AxisTuning
+        "horizontal" stands for north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Ekf2Replay
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
-        Changes of the difference KF - EKF2 by each replacement of one KF property by the EKF2
-        property.
+        Difference KF - EKF2 while the settings of KF are replaced by those of EKF2 one at a time.
     trials : tuple of Trial
-        Re-runs with a change along the aisle, else along the first axis, and along each axis whose
-        mean NIS or NEES is outside its limits.
-    aids : mapping of PX4's name to AidResult
-        Aiding sources of EKF2 with statistics of their innovations; empty without innovations.
-    loop : Loop
+        Re-runs of both filters, each with one change.
     card : Card
         Diagnosis that cover, terminal, web page and batch table show.
-    findings : tuple of Finding
-        Most severe first; of the same severity, missing data before noises.
-    notes : tuple of str
-        Sentences on choices of the analysis.
-    missing : tuple of Unavailable
-        Missing data, with reasons and actions.
-    student : Student
-    provenance : Provenance
     convention : Convention
         Axes, unit, clock and orientation of the source as sent. Absent for GNSS, and without IMU or
         attitude.
@@ -291,9 +262,9 @@ class EvaluationResults(Evaluation, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the parameters in
-    ``whatif`` are the maximum-likelihood estimates. ``sweep`` contains one summary per value of the
-    swept parameter.
+    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the user gave no
+    parameters, so that ``whatif`` has the maximum-likelihood estimates. ``sweep`` has one summary
+    per value of the swept parameter.
     """
 
     schema: Schema
@@ -313,16 +284,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
 class ChangeResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse diff``: differences from A to B.
 
-    Attributes
-    ----------
-    schema : Schema
-    a, b : DiffInput
-    settings : tuple of SettingChange
-    numbers : tuple of NumberChange
-    findings : tuple of FindingChange
-    worse : tuple of str
-        One sentence for each verdict that is worse in B; the exit code is 1 if there is one.
-    provenance : Provenance
+    ``worse`` has one sentence for each verdict that is worse in B; the exit code is then 1.
     """
 
     schema: Schema
@@ -372,7 +334,7 @@ def schema() -> dict[str, Any]:
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
     count = 0
-    # each iteration adds the types inside RecordOrUnavailable, which msgspec does not resolve
+    # repeated until describe_union finds no new types inside of RecordOrUnavailable types
     while count < len(kinds):
         count = len(kinds)
         _, components = msgspec.json.schema_components(
