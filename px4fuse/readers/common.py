@@ -1,12 +1,10 @@
 """Common functions of all readers: valid rows, time intervals, missing data."""
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.flight.model import Columns, Ekf2, FlightMode, Spans, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 
 # Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
 # larger values are from damaged bytes
@@ -38,21 +36,12 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
-    """Return start (s), end (s) and value of each interval in which a time series is constant."""
-    changes = values[values.ne(values.shift())]
-    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
-    return [(start, end, value) for start, end, value in spans if end > start]
-
-
 def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
-    return tuple(
-        (start, end)
-        for start, end, is_landed in constant_spans(landed, duration_s)
-        if not is_landed
-    )
+    changes = landed[landed.ne(landed.shift())]
+    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    spans = zip(starts, [*starts[1:], duration_s], changes, strict=False)
+    return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
 
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
@@ -65,11 +54,6 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
     flying = ", in flight" if in_flight else ""
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
-
-
-def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Convert flight mode names over time to intervals (s) with one mode."""
-    return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
 def finite_rows(

@@ -18,12 +18,6 @@ AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
-AUTO_MAIN_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
-NO_MODES = Unavailable(
-    "flight modes",
-    "the recording has no HEARTBEAT of a PX4 autopilot",
-    "Record the link of a PX4 vehicle.",
-)
 ARDUPILOT_REPLAY = Unavailable(
     "estimator replay",
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
@@ -90,10 +84,7 @@ _TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
-AUTOPILOTS, MAIN_MODES, AUTO_MODES = (
-    msgspec.convert(_TABLE[name], dict[int, str], strict=False)
-    for name in ("autopilots", "main_modes", "auto_modes")
-)
+AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)
 UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))

@@ -40,7 +40,6 @@ _TABLE = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
-NAV_STATES = msgspec.convert(_TABLE["nav_states"], dict[int, str], strict=False)
 UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
