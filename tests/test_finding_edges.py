@@ -77,7 +77,7 @@ from px4fuse.flight.position_source import (
 def with_fusion(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
     """EKF2 fields with a fusion flag that changes at these times."""
     time, value = zip(*pairs, strict=True)
-    return {"fusing": pd.DataFrame({column: value}, index=list(time), dtype=float)}
+    return {"fusion_flags": pd.DataFrame({column: value}, index=list(time), dtype=float)}
 
 
 def make_finding(name: str, level: Any = "error", caused_by: str | None = None) -> Finding:
@@ -471,7 +471,7 @@ def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
     for has_ulog in (True, False):
-        one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
+        one = analysis(source=frd, ekf2={"fusion_flags": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
         assert ("Give the ULog" in finding.remedy) is has_ulog

@@ -52,9 +52,9 @@ def detect(analysis: Comparison) -> Findings:
 def detect_missing_fusion(analysis: Comparison) -> Findings:
     """Detect that EKF2 did not fuse the source, or only in a part of the segment."""
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
-    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
+    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
-    fusing = ekf2.fusing["horizontal"]
+    fusing = ekf2.fusion_flags["horizontal"]
     share = fraction_on(fusing, analysis.segment)
     if share >= MIN_FUSING_SHARE_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusing)

@@ -139,7 +139,7 @@ def _detect_gyro_bias(states: pd.DataFrame, at_rest: pd.Series | None) -> Findin
 
 
 def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
-    fusing, segment = ekf2.fusing, analysis.segment
+    fusing, segment = ekf2.fusion_flags, analysis.segment
     has_own_yaw = analysis.source.frame == "FRD" or (
         isinstance(fusing, pd.DataFrame) and fraction_on(fusing["yaw"], segment) > 0.0
     )

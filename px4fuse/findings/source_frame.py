@@ -51,7 +51,7 @@ def detect(analysis: Analysis) -> Findings:
 def make_frame_finding(analysis: Analysis) -> Finding:
     """Make the finding of positions in a frame FRD, whose x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
+    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
     fault = (
         f"{capitalise_first(positions_of(analysis.source))} are in FRD: their x axis is the "

@@ -76,7 +76,7 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     effect = ""
     if isinstance(fusing, pd.DataFrame) and not fraction_on(fusing["horizontal"], segment):
         effect = f"EKF2 never fused the positions: for EKF2 they are {STAMP_FAULTS[clock]}. "

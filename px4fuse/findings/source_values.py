@@ -233,7 +233,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     differences = [_difference_m(position_m, time_s - d, state) for d in DELAYS_S]
     best = int(np.nanargmin(differences)) if np.isfinite(differences).any() else 0
-    fusing = ekf2.fusing
+    fusing = ekf2.fusion_flags
     is_fused = isinstance(fusing, Unavailable) or bool(
         (fusing["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
     )
