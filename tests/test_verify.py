@@ -473,7 +473,7 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     ),
     "an annotation": (
         lambda w: w.add_annotation(1, Link(rect=(50, 50, 200, 70), url="http://example.org")),
-        "cannot verify", "page 2: the PDF contains an annotation that px4fuse does not write",
+        "cannot verify", "page 2: the PDF contains an annotation, which px4fuse does not write",
     ),
     "a part that nothing refers to": (lambda w: w._add_object(dictionary()), "verified", ""),
 }  # fmt: skip
