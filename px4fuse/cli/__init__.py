@@ -37,6 +37,7 @@ COMMANDS = {
     "verify": "Verify that the numbers of a report follow from its log.",
     "grade": "Verify and grade the reports of a class.",
     "sample": "Write the sample logs (aisle with UWB, loop with VIO).",
+    "mcp": "Serve px4fuse to assistants (Model Context Protocol).",
     "lesson": "Print the worked examples of the lesson UAT 366, module 2.",
 }
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 from click.core import ParameterSource
 
+from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
@@ -122,6 +123,24 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
+#: Option --timeout of commands that analyse logs in worker processes
+timeout_option = click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(1.0),
+    metavar="SECONDS",
+    default=TIMEOUT_S,
+    help="Maximum time for one log (s); a log that takes longer fails.",
+)
+#: Option --memory of commands that analyse logs in worker processes
+memory_option = click.option(
+    "--memory",
+    "memory_gb",
+    type=click.FloatRange(1.0),
+    metavar="GB",
+    default=4.0,
+    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
+)
 # The size limit of logs is not part of a request, because it does not affect results
 max_size_option = click.option(
     "--max-size",

@@ -39,6 +39,9 @@ UNWRAPPED_WIDTH = 10_000
 WRITTEN_KEY = "px4fuse.written"
 # Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
+# Keys in the context of click that px4fuse mcp sets: function that sends the activity of a run, and
+# list to which the results (JSON text) are added instead of being printed
+SEND_KEY, RESULTS_KEY = "px4fuse.send", "px4fuse.results"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 # HTML element that contains the command and the SHA-256 of the log of a web page
@@ -72,6 +75,9 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
     In a pipe, or if ``output`` is standard output, the function shows nothing.
     """
+    if (send := click.get_current_context().meta.get(SEND_KEY)) is not None:
+        yield lambda activity, *_: send(activity)
+        return
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -217,6 +223,9 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
+    if (recorded := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
+        recorded.append(text)
+        json_path = None if json_path == STANDARD_OUTPUT else json_path
     if output is not None and analysis is not None:
         from px4fuse.report.pdf import render
 
