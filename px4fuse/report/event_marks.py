@@ -34,7 +34,7 @@ MODE_LETTER_WIDTH = 5.0  # mean width (points) of a letter of a flight mode's na
 
 
 class Mark(NamedTuple):
-    """Events of one type on a time axis: markers at `height` (0 to 1), else bands."""
+    """Events of one type on a time axis: markers at a height (0 to 1), or bands without height."""
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -61,17 +61,9 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 def draw_marks(
     axes: Axes, analysis: Analysis, *, axis: str | None = None, with_mode_names: bool = False
 ) -> None:
-    """Draw gaps, flight modes, resets, rejections and outliers, and limit the time axis.
+    """Draw gaps, flight modes, resets, rejections and outliers on a time axis.
 
-    Parameters
-    ----------
-    axes : Axes
-        x in seconds since the first data.
-    analysis : Analysis
-    axis : str, optional
-        Axis of the rejections to mark, by default the main axis; "" for none.
-    with_mode_names : bool
-        Write the names of the flight modes above the axes.
+    ``axis`` selects the rejections: by default those of the main axis, none for "".
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -110,13 +102,7 @@ def panel(
     with_mode_names: bool = False,
     with_time_label: bool = True,
 ) -> Axes:
-    """Add a plot over time with the events of :func:`draw_marks`.
-
-    Parameters
-    ----------
-    with_time_label : bool
-        False if a plot below this one has the label of the time axis.
-    """
+    """Add a plot over time with the events of :func:`draw_marks`."""
     with_mode_names = with_mode_names and bool(analysis.events.modes)
     axes = page.panel(
         title, caption, height, above=max(above, MODE_NAMES_HEIGHT if with_mode_names else 0.0)
@@ -159,7 +145,6 @@ def visible_times(times: Any, min_interval_s: float) -> Array:
 
 
 def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
-    """Write the name of each flight mode above the axes if the mode is long enough."""
     low, high = axes.get_xlim()
     width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in analysis.events.modes:
