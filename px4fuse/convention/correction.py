@@ -87,7 +87,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=fault)
-    fusion_flags = flight.ekf2.fusing if isinstance(flight.ekf2, Ekf2) else None
+    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
     is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
     has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")

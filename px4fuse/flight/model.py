@@ -92,15 +92,6 @@ class Columns:
     ]
 
 
-@dataclass(frozen=True)
-class FlightMode:
-    """Time interval (s) in one flight mode, with the name that QGroundControl shows."""
-
-    start_s: float
-    end_s: float
-    name: str
-
-
 class Alignment(Record, frozen=True, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
@@ -340,8 +331,8 @@ class AidLog:
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at times; before its start, the first value."""
-    rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    return np.asarray(steps, dtype=np.float64)[rows]
+    previous_rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    return np.asarray(steps, dtype=np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
@@ -367,7 +358,7 @@ class Ekf2:
     innovation_topics: tuple[str, ...]
     # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
     # ``yaw``
-    fusing: TableOrUnavailable
+    fusion_flags: TableOrUnavailable
     resets: tuple[Reset, ...]
     # (Start time, primary instance from then on)
     instances: tuple[tuple[float, int], ...]
@@ -416,13 +407,6 @@ class Truth:
     __repr__ = one_line_repr
 
 
-MODES_NOT_LOGGED = Unavailable(
-    "flight modes",
-    "vehicle_status is not logged or not usable",
-    "Record with SDLOG_PROFILE bit 0 (default).",
-)
-
-
 # Flights are compared by identity (eq=False), because caches use flights as keys
 @dataclass(frozen=True, eq=False)
 class Flight:
@@ -460,7 +444,6 @@ class Flight:
     unused: tuple[UnusedData, ...] = ()
     # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
-    modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
     # Intervals in which PX4's failure detector reports roll or pitch beyond the limits
     tumble_spans: Spans = ()
     # Barometer height ``down_m`` with unknown zero
