@@ -58,7 +58,7 @@ def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "
     suffix : str
         Suffix of the element ids, for pages with several flights.
     """
-    document, places = document_json(data, analysis)
+    document, places = document_json(data)
     content = {"flight": data, "ranges": ranges(), "packed": packer.specs, "places": places}
     figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
     return figures + "\n".join(
