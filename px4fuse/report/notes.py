@@ -1,6 +1,6 @@
-"""Page with the answer form and the student's notes (Markdown as plain text, lists and tables).
+"""Page with the answer form and the notes (Markdown) of the student.
 
-A picture becomes its description, and HTML tags are removed. Nothing is loaded or executed.
+HTML tags are removed, and pictures are not loaded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes of the student; no page without both."""
+    """Draw the answer form and the notes of the student, if there are any."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
@@ -56,13 +56,7 @@ def write(page: Page, notes: str) -> None:
 
 
 def parse(notes: str, name: str = "the notes") -> list[Token]:
-    """Parse Markdown into tokens.
-
-    Parameters
-    ----------
-    notes : str
-    name : str
-        Name of the text in error messages.
+    """Parse Markdown into tokens; ``name`` is the name of the text in errors.
 
     Raises
     ------
@@ -88,7 +82,6 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
-    """Write the child blocks of a Markdown node; `mark` precedes the first line of a list item."""
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
