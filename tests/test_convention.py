@@ -294,11 +294,14 @@ def test_enu_orientation_finding_of_ned_source_names_conversion():
 def fused(flight: Flight) -> Flight:
     """Return a flight in which EKF2 fused the position and the yaw of the source."""
     fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [1.0]}, index=[0.0])
-    return replace(flight, ekf2=replace(flight.ekf2, fusing=fusing))
+    return replace(flight, ekf2=replace(flight.ekf2, fusion_flags=fusing))
 
 
 @pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
-    (("west", "south", "up"), 20.0, Faults(axes=True, affects_ekf2=True, is_north_unknown=True)),
+    (
+        ("west", "south", "up"), 20.0,
+        Faults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
+    ),
     (("west", "north", "down"), -32.0, Faults()),
 ])  # fmt: skip
 def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_deg, expected):

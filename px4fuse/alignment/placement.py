@@ -1,16 +1,11 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-The computer of a UWB system records with a separate clock and frame. The track of the file is
-matched with a reference in the log:
+The computer of a UWB system has a separate clock and frame. The track of the file is matched with
+EKF2's position or, if this is not suitable, with the acceleration integrated twice. The time offset
+is found by cross-correlation at all lags, and refined by robust least squares. It is relative to
+the reference: if EKF2 fused late positions, it includes their delay.
 
-1. EKF2's position;
-2. if EKF2's position is not suitable, the acceleration of the IMU integrated twice. Both tracks are
-   then band-pass filtered.
-
-Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
-The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
-refined by robust least squares. The time offset is relative to the reference: if EKF2 fused late
-positions, EKF2's position is late, and the time offset includes this delay.
+Horizontal positions are complex numbers, north + i·east: a rotation in yaw is a factor e^{i·yaw}.
 """
 
 from collections.abc import Iterator
@@ -152,11 +147,13 @@ def align_position_file(
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
     """Return the clock of a file in which most rows repeat a timestamp, else None."""
-    distinct = len(recording.samples)
-    count = distinct + recording.dropped
-    if distinct > MAX_DISTINCT_FRACTION * count:
+    distinct_count = len(recording.samples)
+    row_count = distinct_count + recording.dropped
+    if distinct_count > MAX_DISTINCT_FRACTION * row_count:
         return None
-    return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
+    return ClockMap(
+        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct_count
+    )
 
 
 def _check_options(

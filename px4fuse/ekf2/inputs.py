@@ -313,8 +313,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         horizon_s=horizon_s,
         predict_s=predict_s(record),
         vision_height=not is_gnss
-        and isinstance(ekf2.fusing, pd.DataFrame)
-        and bool(ekf2.fusing["vertical"].mean() > 0.5),
+        and isinstance(ekf2.fusion_flags, pd.DataFrame)
+        and bool(ekf2.fusion_flags["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
         logged_height_reason=logged_height_reason,
@@ -486,7 +486,9 @@ def read_vision(
     timestamp_s = samples.index.to_numpy()
     position = samples[Columns.POSITION].to_numpy(copy=True)
     variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    is_rotated_by_ekf2 = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
+    is_rotated_by_ekf2 = (
+        not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
+    )
     if fuses_by_mask(record.parameters):
         is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:
@@ -510,13 +512,13 @@ def read_vision(
         variance = rotate(rotation**2, variance)
     age = record.vision_age_s
     # without arrival times no sample is treated as late
-    arrival = np.full(len(timestamp_s), -np.inf)
+    arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival = timestamp_s + np.interp(timestamp_s, age.index, age)
+        arrival_s = timestamp_s + np.interp(timestamp_s, age.index, age)
     decisions = _logged_decisions(ekf2, record, timestamp_s)
     return ReceivedPositions(
         timestamp_s,
-        arrival,
+        arrival_s,
         position,
         variance,
         *decisions,

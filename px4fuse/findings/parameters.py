@@ -45,7 +45,7 @@ def detect(analysis: Analysis) -> Findings:
         old, new = (_part(analysis, *edges_s[i : i + 2]) for i in (number, number + 1))
         unit = "" if name in switches else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect, has_effect = "", False
-        since = f"before {time_s:.1f} s and {{}} from then on"
+        since = "before the change and {} after it"
         if abs(new.fused_fraction - old.fused_fraction) > MIN_FUSING_CHANGE:
             has_effect = True
             effect += (
@@ -55,8 +55,8 @@ def detect(analysis: Analysis) -> Findings:
         elif old.verdict and new.verdict:
             has_effect = _differ(old.sigma_ratio, new.sigma_ratio)
             effect = (
-                f" Before {time_s:.1f} s EKF2 is {old.verdict}, from {time_s:.1f} s on it is "
-                f"{new.verdict} (innovations along the main axis)."
+                f" EKF2 is {old.verdict} before the change and {new.verdict} after it "
+                "(innovations along the main axis)."
             )
         if _differ(old.rmse_m, new.rmse_m):
             has_effect = True
@@ -64,7 +64,10 @@ def detect(analysis: Analysis) -> Findings:
                 f" EKF2's position RMSE along the main axis is {format_metres(old.rmse_m)} m "
                 f"{since.format(f'{format_metres(new.rmse_m)} m')}."
             )
-        action = f"Evaluate both parts separately (--end {time_s:.1f}, --start {time_s:.1f})."
+        action = (
+            "Analyse the flight before and after the change separately "
+            f"(--end {time_s:.1f}, --start {time_s:.1f})."
+        )
         if name in switches:
             action = f"Do not change {name} in flight. {action}"
         yield (warning if has_effect else note)(
@@ -88,22 +91,21 @@ def _part(analysis: Analysis, start_s: float, end_s: float) -> Part:
     errors = position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = float(np.sqrt((errors["error_m"].loc[start_s:end_s] ** 2).mean()))
-    if isinstance(ekf2, Ekf2) and not isinstance(ekf2.fusing, Unavailable):
+    if isinstance(ekf2, Ekf2) and not isinstance(ekf2.fusion_flags, Unavailable):
         span = replace(analysis.segment, start_s=start_s, end_s=end_s)
-        fused = fraction_on(ekf2.fusing["horizontal"], span)
+        fused = fraction_on(ekf2.fusion_flags["horizontal"], span)
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
         return Part("", nan, rmse_m, fused)
-    inside = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
+    samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     result = assess(
-        inside["innovation_m"].to_numpy(), inside["innovation_variance_m2"].to_numpy(), math.inf
+        samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     if isinstance(result, Unavailable):
         return Part("", nan, rmse_m, fused)
-    ratio, size = result.sigma_ratio, "small"
-    if ratio < 1.0:
-        ratio, size = 1.0 / ratio, "large"
-    verdict = f"{result.verdict} (σ {format_ratio(ratio)} times too {size})"
+    direction = "small" if result.sigma_ratio > 1.0 else "large"
+    factor = format_ratio(result.sigma_error_factor)
+    verdict = f"{result.verdict} (σ {factor} times too {direction})"
     if result.verdict == "consistent":
-        verdict = "consistent"
+        verdict = result.verdict
     return Part(verdict, result.sigma_ratio, rmse_m, fused)

@@ -51,7 +51,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     logs.
     """
     enabled_aids = {}
-    tables = topics.of(px4.STATUS_FLAGS)
+    tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *DISTURBANCES.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
@@ -86,8 +86,10 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
         )
     }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
-    more = {"observation_down": "observation", "filtered_down": "innovation_filtered"}
-    layout = Layout(f"estimator_aid_src_{aid.name}", columns, more if aid == BAROMETER else {})
+    barometer_columns = {"observation_down": "observation", "filtered_down": "innovation_filtered"}
+    layout = Layout(
+        f"estimator_aid_src_{aid.name}", columns, barometer_columns if aid == BAROMETER else {}
+    )
     if topics.find(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
@@ -100,7 +102,7 @@ def _read_common_topics(
     topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 ) -> AidLog | None:
     is_in_gauss = aid.name == "mag_heading" and any(
-        "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
+        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
     layouts = []
     if aid.fields and not is_in_gauss:

@@ -286,22 +286,8 @@ def rmse_interval(
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
-    times of the squared errors. Percentiles are widened according to Student's t for the number of
-    blocks (Hesterberg 2015, section 5.3).
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n,)
-        Errors in order of time.
-    analysis_name : str
-        Name of the score, for Unavailable.
-    min_block : int
-        Minimum block length: the number of pairs that overlap, because overlap correlates errors.
-
-    Returns
-    -------
-    Interval or Unavailable
-        Unavailable with fewer than five blocks.
+    times. Percentiles are widened for a small number of blocks (Hesterberg 2015, section 5.3).
+    ``min_block`` is the number of pairs that overlap, because overlap correlates errors.
     """
     squares = errors**2
     n = len(squares)
@@ -315,18 +301,22 @@ def rmse_interval(
             f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
-    sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
+    cumulative_squares = np.concatenate(
+        ([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1]))))
+    )
     block_means = (
-        sums[length:] - sums[:-length]
+        cumulative_squares[length:] - cumulative_squares[:-length]
     ) / length  # mean squared error of each circular block
     block_count = n / length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
         0, n, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
-    means = block_means[block_starts].mean(axis=1)
+    resampled_means = block_means[block_starts].mean(axis=1)
     quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
-    tail = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
-    low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
+    tail_probability = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
+    low, high = np.sqrt(
+        np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
+    )
     return Interval(float(low), float(high), length, block_count)
 
 
