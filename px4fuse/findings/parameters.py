@@ -50,8 +50,8 @@ def detect(analysis: Analysis) -> Findings:
         if _differ(old.rmse_m, new.rmse_m):
             has_effect = True
             effect += (
-                f" EKF2's position RMSE along the main axis is {format_metres(old.rmse_m)} m before "
-                f"the change and {format_metres(new.rmse_m)} m after it."
+                f" EKF2's position RMSE along the main axis is {format_metres(old.rmse_m)} m "
+                f"before the change and {format_metres(new.rmse_m)} m after it."
             )
         action = (
             "Analyse the flight before and after the change separately "
