@@ -298,7 +298,10 @@ def fused(flight: Flight) -> Flight:
 
 
 @pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
-    (("west", "south", "up"), 20.0, Faults(axes=True, affects_ekf2=True, is_north_unknown=True)),
+    (
+        ("west", "south", "up"), 20.0,
+        Faults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
+    ),
     (("west", "north", "down"), -32.0, Faults()),
 ])  # fmt: skip
 def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_deg, expected):

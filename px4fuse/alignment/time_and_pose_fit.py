@@ -151,11 +151,8 @@ def fit_by_least_squares(
 ) -> Fit:
     """Fit the file to the reference by robust least squares (soft L1).
 
-    1. The origin is always fitted. Otherwise a position offset of the file would be mistaken for a
-       lag if the vehicle flies mostly in one direction.
-    2. The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None.
-    3. The covariance is σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual. It is multiplied
-       by 1 + 2Σρ for autocorrelated residuals (sum to the first zero of ρ).
+    The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None. The origin is always
+    fitted: on a flight in one direction, an offset of the origin would look like a lag.
 
     Raises
     ------

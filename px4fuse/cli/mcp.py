@@ -20,9 +20,9 @@ from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
 from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
 from px4fuse.errors import SettingsError
 
-# Names of arguments of tools that differ from the names of the parameters of commands
+# Name of the argument of a tool, by the name of the command's parameter if the names differ
 ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
-# Parameters of commands that are no arguments of tools: outputs, exit codes and the student
+# Parameters of commands that tools do not have: outputs, exit codes and student
 HIDDEN = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),

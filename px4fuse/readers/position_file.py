@@ -134,8 +134,7 @@ def read_position_file(
     Raises
     ------
     LogError
-        The file cannot be read, is not a text table, has no columns of time and position, has more
-        columns than header names, or has fewer than three usable rows.
+        The file cannot be read, or contains no table of times and positions.
     SettingsError
         An option has an invalid value or names a column that is not in the file.
     """

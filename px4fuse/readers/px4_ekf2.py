@@ -219,9 +219,8 @@ def samples_per_step(
 ) -> int:
     """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 divides ``configured_step_s`` by a mean of the measured intervals and rounds, so a ratio
-    near n + 0.5 may be rounded up or down. This function rounds up, unless only the smaller number
-    is consistent with ``step_ends``, the logged ends of predictions (index of the IMU sample).
+    EKF2 may round a ratio near n + 0.5 up or down. It is rounded up here, unless only the smaller
+    number agrees with ``step_ends``, the indices of IMU samples at which logged predictions end.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)

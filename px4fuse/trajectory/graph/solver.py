@@ -43,33 +43,21 @@ _MAX_TRUNCATION_ROUNDS = 20
 
 
 class Solution(Record, frozen=True, kw_only=True):
-    """Solution of a pose graph: costs, iterations, dropped edges, poses and weights.
+    """Solution of a pose graph."""
 
-    Attributes
-    ----------
-    cost_initial : float
-        Half of the sum of the squared Mahalanobis distances at the initial poses, with all weights
-        1.
-    cost : float
-        Half of the weighted sum of the squared Mahalanobis distances at the solution.
-    iterations : int
-        Number of accepted steps, over all starts and stages.
-    converged : bool
-        True if the last step changed the cost by less than the tolerance.
-    dropped : int
-        Number of edges with a weight below 0.5.
-    poses : ndarray, shape (n, 3) or (n, 7)
-        Optimised poses; the first pose is unchanged.
-    weights : ndarray, shape (m,)
-        Factors on the information of each edge, from 0 (ignored) to 1.
-    """
-
+    # Half of the sum of the squared Mahalanobis distances at the initial poses
     cost_initial: NotNegative
+    # Half of the weighted sum of the squared Mahalanobis distances at the solution
     cost: NotNegative
+    # Number of accepted steps, over all starts and stages
     iterations: Count
+    # True if the last step changed the cost by less than the tolerance
     converged: bool
+    # Number of edges with a weight below 0.5
     dropped: Count
+    # Optimised poses; the first pose is unchanged
     poses: NotWritten[Array] = NOT_WRITTEN
+    # Factor on the information of each edge, from 0 (ignored) to 1
     weights: NotWritten[Array] = NOT_WRITTEN
 
 
