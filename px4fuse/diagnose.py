@@ -9,8 +9,6 @@
 7. find: faults of the flight, with their causes
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
