@@ -165,7 +165,7 @@ def test_read_results_ignores_fields_of_newer_minor_version():
 
 @pytest.mark.parametrize(
     ("provenance", "said"),
-    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the version that wrote it.")],
+    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "px4fuse of that schema version.")],
 )
 def test_read_results_of_schema_3_names_px4fuse_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
@@ -190,7 +190,7 @@ def test_results_json_numbers_have_ten_significant_digits():
 def test_results_omit_number_outside_bounds_and_state_reason():
     """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
-    assert within_bounds(results) is results
+    assert within_bounds(results) == results
     axis = results.axes["aisle"]
     kf = replace(axis.filters["kf"], nis_mean=-3.0)
     ekf2 = replace(axis.filters["ekf2"], sigma_p_median_m=1e10)

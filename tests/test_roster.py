@@ -115,7 +115,7 @@ BAD_ROSTERS = {
     "same file": ("id\na/b\na:b\n", "the id of 'a:b' cannot be used as a file name"),
     "no usable characters": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not a text file"),
-    "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
+    "spreadsheet": (b"PK\x03\x04....", "Save the table as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
     "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
     "quotes never closed": ('id,name\n1,"Ada\n2,Bob\n', "not a CSV file"),
@@ -238,6 +238,18 @@ def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> No
     sheet = table(tmp_path, hidden)
     people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
     assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
+
+
+def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
+    sheet = table(tmp_path, MOODLE)
+    scaled = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS, 50.0)[0]
+    maximum = ENTRIES[0].max_points
+    assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
+
+
+def test_read_people_reads_extension_of_due_time(tmp_path) -> None:
+    sheet = table(tmp_path, "id,name,Extension\n0042,Jane Doe,2026-11-22 12:00\n7,Max Roe,\n")
+    assert [person.extended_due for person in read_people(sheet)] == ["2026-11-22 12:00", ""]
 
 
 def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:

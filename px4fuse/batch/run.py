@@ -37,7 +37,7 @@ from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.request import ComparisonRequest, command_line
 
-# Table columns with the paths of a log's outputs, relative to the output folder
+# Table columns with the paths of the outputs of a log, relative to the output folder
 FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
@@ -46,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Table and written files of a run of ``px4fuse batch``.
+    """Table of a run of ``px4fuse batch``, with the severities of all findings.
 
     Attributes
     ----------
@@ -54,8 +54,6 @@ class BatchResult:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     reused_count : int
         Number of logs whose results are from an earlier run.
-    severities : frozenset of str
-        Severities of all findings.
     written : tuple of Path
         Files of the table.
     """
@@ -181,7 +179,7 @@ def run(
     """
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
         raise SettingsError(
-            "batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
+            "px4fuse batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
         )
     logs = find_logs(paths)
     check_output_folder(output)
@@ -228,21 +226,23 @@ def run(
 
 
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of the logs with finished outputs in the folder, by size of the log."""
+    """Return the SHA-256 of finished logs by size, as only logs of equal size may be identical."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
         first_row = cached_rows.rows[0]
-        files = [state.output / first_row.get(kind, "") for kind in FILE_COLUMNS[: 1 + reports]]
-        if "axis" not in first_row or all(file.is_file() for file in files):
+        output_files = [
+            state.output / first_row.get(column, "") for column in FILE_COLUMNS[: 1 + reports]
+        ]
+        if "axis" not in first_row or all(output_file.is_file() for output_file in output_files):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
 
 def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
     """Yield the cached table rows in a folder for this px4fuse version and these settings."""
-    for file in sorted((folder / "rows").glob("*.json")):
+    for cache_file in sorted((folder / "rows").glob("*.json")):
         try:
-            cached_rows = msgspec.json.decode(file.read_bytes(), type=CachedRows)
+            cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
         if (cached_rows.px4fuse, cached_rows.settings) == (px4fuse, settings):
@@ -297,7 +297,7 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
         status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}"
         if first_log is log:
             status = FAILED
-            reason = "another run of px4fuse batch replaced the rows of this log"
+            reason = "another run of px4fuse batch changed the results of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 from click.core import ParameterSource
 
+from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
@@ -35,11 +36,6 @@ from px4fuse.request import (
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
-
-
-def parse_columns(text: str) -> tuple[str, ...]:
-    """Parse comma-separated column names, or column numbers, of a position file."""
-    return tuple(text.split(","))
 
 
 Option = Callable[[Callable[..., None]], Callable[..., None]]
@@ -77,22 +73,16 @@ class InputPath(NonEmptyPath):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = super().convert(value, param, ctx)
-        file, colon, _ = str(path).rpartition(":")
-        add_input(Path(file) if colon and not Path(path).exists() else Path(path))
+        file, separator, _ = str(path).rpartition(":")
+        add_input(Path(file) if separator and not Path(path).exists() else Path(path))
         return path
 
 
 class TypedQuantity(click.ParamType["float | str"]):
-    """Option type of a number in a fixed unit.
+    """Option type of a number in a fixed unit of :data:`px4fuse.core.units.UNIT_NAMES`.
 
-    Parameters
-    ----------
-    unit : str
-        One of :data:`px4fuse.core.units.UNIT_NAMES`.
-    example : float
-        Number that the error message suggests if the typed text is not a number.
-    auto : bool
-        True to accept the text "auto" in addition.
+    The error for a text that is not a number suggests ``example``. If ``auto`` is True, the text
+    "auto" is also accepted.
     """
 
     name = "number"
@@ -115,9 +105,9 @@ class TypedQuantity(click.ParamType["float | str"]):
             number = float(value)
         except ValueError:
             converted = convert_to_unit(value, self.unit)
-            example_text = f"{self.example if converted is None else converted:.12g}"
+            example = self.example if converted is None else converted
             self.fail(
-                f"{value!r} is not a number{unit}. Give for example {example_text}"
+                f"{value!r} is not a number{unit}. Give for example {example:.12g}"
                 f"{', or auto' if self.auto else ''}.",
                 param,
                 ctx,
@@ -133,6 +123,24 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
+#: Option --timeout of commands that analyse logs in worker processes
+timeout_option = click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(1.0),
+    metavar="SECONDS",
+    default=TIMEOUT_S,
+    help="Maximum time for one log (s); a log that takes longer fails.",
+)
+#: Option --memory of commands that analyse logs in worker processes
+memory_option = click.option(
+    "--memory",
+    "memory_gb",
+    type=click.FloatRange(1.0),
+    metavar="GB",
+    default=4.0,
+    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
+)
 # The size limit of logs is not part of a request, because it does not affect results
 max_size_option = click.option(
     "--max-size",
@@ -164,10 +172,7 @@ def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
 
 
 def output_option(metavar: str, text: str, **details: Any) -> Option:
-    """Declare -o for an output file or folder.
-
-    Further arguments of ``click.option`` are in ``details``.
-    """
+    """Declare -o for an output file or folder; ``details`` are arguments of ``click.option``."""
     return click.option(
         "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
     )
@@ -180,7 +185,6 @@ def report_options(text: str) -> Option:
 
 
 def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    """Declare --fail-on: exit code 1 on a finding of a severity."""
     return click.option("--fail-on", type=Choice(severities), help=text)
 
 
@@ -256,7 +260,7 @@ position_options = _combine_options(
     ),
     click.option(
         "--position-columns",
-        type=parse_columns,
+        type=lambda names: tuple(names.split(",")),
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of the columns of the position file; SIGMA is the standard "
         "deviation of the position.  [default: detected from the names]",

@@ -11,16 +11,16 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS along north and east for separate noise estimates, which take time
+# Minimum ratio of the mean NIS along north and east for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of time spans into which a flight is divided to find a noisy one
+# Maximum number of equal time spans of a flight that are searched for a noisy one
 MAX_PARTS = 12
-# Minimum number of measurements in each time span into which a flight is divided
+# Minimum number of measurements in each of these time spans
 MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations; ``ratio`` is their σ relative to the other times."""
+    """Time span (s) with larger innovations; ``ratio``: their σ ÷ σ in the rest of the flight."""
 
     start_s: float
     end_s: float
@@ -48,27 +48,27 @@ def find_noisy_part(
 ) -> NoisyPart | None:
     """Find one time span of the flight in which most innovations are larger.
 
-    ``axis_tuning`` is the noise estimate of both horizontal axes.
+    ``axis_tuning`` is the noise estimate of north and east.
     """
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # without noise estimates (a third of the measurements resemble outliers) use the settings of KF
+    # with many noisy measurements the noises cannot be estimated: use the settings of KF
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    lines = [result.axis for result in north_and_east(comparison)]
-    if sigma_a is None or sigma_z is None or len(lines) < 2:
+    axes = [result.axis for result in north_and_east(comparison)]
+    if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
-    increments_by_axis = [preintegrate(line, settings) for line in lines]
-    time = lines[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
-    if len(time) < MAX_PARTS * MIN_PART_COUNT // 2:
+    increments_by_axis = [preintegrate(line, settings) for line in axes]
+    time_s = axes[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
+    if len(time_s) < MAX_PARTS * MIN_PART_COUNT // 2:
         return None
-    count = min(MAX_PARTS, len(time) // MIN_PART_COUNT)
-    edges = np.linspace(0, len(time), count + 1).astype(int)
+    count = min(MAX_PARTS, len(time_s) // MIN_PART_COUNT)
+    edges = np.linspace(0, len(time_s), count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
         # wrong noise settings would change the size of innovations along the flight
@@ -80,18 +80,18 @@ def find_noisy_part(
         # the median of each axis removes the difference between the axes
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
-    sizes = relative_innovations(None)
-    part_sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
+    relative_sizes = relative_innovations(None)
+    part_sigma = np.array([np.median(relative_sizes[:, low:high]) for low, high in pairwise(edges)])
     is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
     first_part = int(np.argmax(is_noisy))
     end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
     if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
         return None  # the noisy time spans are not contiguous
-    is_quiet = np.ones(len(time), bool)
+    is_quiet = np.ones(len(time_s), bool)
     is_quiet[edges[first_part] : edges[end_part]] = False
     ratios = (
         float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
-        for relative in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
+        for relative in (relative_sizes, relative_innovations(np.isin(time_s, outlier_time_s)))
     )
-    start_s, end_s = time[[edges[first_part], edges[end_part] - 1]].tolist()
+    start_s, end_s = time_s[[edges[first_part], edges[end_part] - 1]].tolist()
     return NoisyPart(start_s, end_s, *ratios)

@@ -74,9 +74,7 @@ DETECTORS = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Return the findings, most severe first; none for an assignment."""
-    if analysis.flight.log.is_assessed:
-        return ()
+    """Return the findings, most severe first."""
     findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 

@@ -67,7 +67,6 @@ class Panel(NamedTuple):
         result: AxisComparison,
         *,
         with_time_label: bool,
-        with_mode_names: bool = False,
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot on a page; a narrow plot has no caption."""
@@ -84,7 +83,6 @@ class Panel(NamedTuple):
             caption,
             height,
             axis=rejection_axis,
-            with_mode_names=with_mode_names,
             with_time_label=with_time_label,
         )
         if is_narrow:

@@ -10,7 +10,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import GraphSolution, solve
+from px4fuse.trajectory.graph.solver import Solution, solve
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -36,7 +36,7 @@ class Graph(Record, frozen=True, kw_only=True):
         Source of the initial poses.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
-    solutions : mapping from key of :data:`SOLUTIONS` to GraphSolution
+    solutions : mapping from key of :data:`SOLUTIONS` to Solution
     """
 
     name: str
@@ -45,7 +45,7 @@ class Graph(Record, frozen=True, kw_only=True):
     edges: Count
     initialised: str
     gates: tuple[GateResult, ...] | Unavailable
-    solutions: Mapping[str, GraphSolution]
+    solutions: Mapping[str, Solution]
 
 
 def analyse_graph(
@@ -57,19 +57,9 @@ def analyse_graph(
 ) -> tuple[Graph, PoseGraph]:
     """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
-    Edges between successive vertices are odometry, all other edges are closures.
-
-    Parameters
-    ----------
-    name : str
-        Name of the graph.
-    run_robust : bool, optional
-        True for robust optimisation, too; by default True with up to 1000 closures.
-
-    Returns
-    -------
-    (Graph, PoseGraph)
-        Results, and the pose graph with the poses of the solution with all closures.
+    Edges between successive vertices are odometry, all other edges are closures. ``run_robust``
+    is by default True with up to 1000 closures. Return also the pose graph with the poses of the
+    least-squares solution.
 
     Raises
     ------
