@@ -32,7 +32,7 @@ CHECKS = {
     "EKF2_RNG_CTRL": "Fly within the range of the distance sensor.",
     "EKF2_OF_CTRL": "Fly over a textured and lit floor.",
     "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
-    "EKF2_EV_CTRL": "Restore line of sight and link of the position source.",
+    "EKF2_EV_CTRL": "Check the position source and its data link.",
 }
 OTHER_CHECK = "Check mounting and power supply of the sensor."
 
