@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exchange import replace
-from filter_tools import TRUE, modelled
+from filter_tools import TRUE, modelled, score_grid
 from flights import line, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +17,7 @@ from scipy.stats import norm
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
-    START_OUTLIER_SHARE,
+    START_OUTLIER_FRACTION,
     START_OUTLIER_WIDTH,
     Likelihood,
     NoiseFit,
@@ -34,7 +34,6 @@ from px4fuse.filter.likelihood import (
     innovations,
     preintegrate,
     profile_ends,
-    score_grid,
 )
 from px4fuse.filter.marginal_likelihood import (
     Positions,
@@ -360,9 +359,9 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
     legs = preintegrate(axis, chosen)
     pairs = [(0.5, 0.1), (0.05, 0.1), (3.0, 0.1), (0.5, 0.01), (0.5, 1.0), (0.02, 2.0)]
     a, z = np.transpose(pairs)
-    nu, s = innovations(legs, a, z)
-    weight = np.ones(len(nu))
-    expected = 0.5 * np.sum(np.log(s) + nu**2 / s, axis=0)
+    scores = [np.log(s) + nu**2 / s for nu, s in (innovations(legs, *pair) for pair in pairs)]
+    expected = 0.5 * np.sum(scores, axis=1)
+    weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
     part = [filter_positions(legs)]
@@ -373,7 +372,7 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
         found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
     )
     # weights have the same meaning in both
-    weight = np.random.default_rng(1).uniform(0.01, 1.0, len(nu))
+    weight = np.random.default_rng(1).uniform(0.01, 1.0, len(weight))
     grid = score_grid([legs], a, z, weight)
     found_values = np.array(
         [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
@@ -510,16 +509,16 @@ def test_outlier_probability_follows_bayes_rule() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
-        narrow = (1.0 - START_OUTLIER_SHARE) * norm.pdf(error) ** axes
-        wide = START_OUTLIER_SHARE * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
+        narrow = (1.0 - START_OUTLIER_FRACTION) * norm.pdf(error) ** axes
+        wide = START_OUTLIER_FRACTION * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
         got = _outlier_probability(
-            axes * error**2, np.full(25, axes), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+            axes * error**2, np.full(25, axes), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
         )
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
     assert (
         _outlier_probability(
-            np.array([1e200]), np.ones(1), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+            np.array([1e200]), np.ones(1), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
         )
         == 1.0
     )

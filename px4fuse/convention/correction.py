@@ -81,7 +81,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=fault)
-    fusing = flight.ekf2.fusing if isinstance(flight.ekf2, Ekf2) else None
+    fusing = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
     is_fused = isinstance(fusing, pd.DataFrame) and bool((fusing > 0).any(axis=None))
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
@@ -169,8 +169,8 @@ def correct(
     if not faults.axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
-    return replace(flight, attitude=table), track
+    attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
+    return replace(flight, attitude=attitude_table), track
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:

@@ -65,22 +65,21 @@ VISION_COPY_INTERVALS_S = {
 }
 # Bit of EKF2_AID_MASK that rotates vision positions, up to PX4 v1.13
 ROTATE_VISION_BIT = 64
-# Maximum time difference (s) between a logged innovation and the measurement time of its sample:
-# estimator_aid_src topics contain EKF2's measurement time within about 1 ms
+# Maximum time difference (s) between a logged innovation and its sample: estimator_aid_src topics
+# contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
 GNSS_VELOCITY_BIT = 4
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
-# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms, and longer IMU intervals lose
-# rotation and vibration
+# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Maximum fraction of IMU samples that EKF2 received but the log does not contain, outside gaps
-MAX_LOST_SHARE = 0.1
+# Maximum fraction of IMU samples missing from the log, outside gaps
+MAX_LOST_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Number that stands for "no limit" of position resets in a row, for releases without a limit
+# Number of position resets in a row for releases without a limit
 UNLIMITED_RESETS = 1_000_000
 # Maximum interval (s) between height and heading measurements in a gap of the position source
 MAX_INTERVAL_S = 0.25
@@ -88,32 +87,26 @@ MAX_INTERVAL_S = 0.25
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """Position samples that EKF2 received, in time order; m is the number of samples.
+    """The m position samples that EKF2 received, in time order.
 
     Attributes
     ----------
     stamp_s, arrival_s : ndarray, shape (m,)
         Timestamps and arrival times.
-    position_m : ndarray, shape (m, 3)
-        Position in NED.
-    variance_m2 : ndarray, shape (m, 3)
-        Variance reported by the sender; 0 if not reported.
+    position_m, variance_m2 : ndarray, shape (m, 3)
+        Position in NED, and variance reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
-        Velocity in NED with its variance, if EKF2 fuses velocity with each position.
+        Velocity in NED, if EKF2 fuses it with each position.
     rejected : ndarray, shape (m,)
-        1 if EKF2's gate rejected the sample, else 0; NaN if not logged.
+        1 if EKF2's gate rejected the sample; NaN if not logged.
     reset : ndarray of bool, shape (m,)
-        True if EKF2 reset its position to the sample; False if rejections are not logged.
-    source : str
-        Name of the position track.
+        True if EKF2 reset its position to the sample.
     uses_sender_times : bool
-        True if EKF2 uses the measurement times of the sender instead of the delay parameter.
+        True if EKF2 ignores its delay parameter.
     reset_s : ndarray
-        Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
+        Timestamps of the samples with a new ``reset_counter``.
     correction_m : ndarray, shape (m, 2), or None
-        EKF2's position correction by each sample (north and east), estimated from the published
-        position. None if all rejections are logged, if none occurred, or with vision that is fused
-        in addition to GNSS.
+        Position correction by each sample, if the log lacks some rejections.
     """
 
     stamp_s: Array
@@ -137,26 +130,23 @@ class FusionRules:
     Attributes
     ----------
     start_interval_s : float
-        Maximum interval from the previous sample to a sample with which fusion starts.
+        Fusion starts if two samples arrive within this time.
     stop_s : float
-        Time without a sample after which fusion stops.
+        Fusion stops after this time without a sample.
     reset_s : float
-        Time of rejections after which the position is reset to the sample.
+        The position is reset after this time of rejections.
     max_resets : int
-        Number of resets in a row after which fusion stops, until a sample with which fusion may
-        start.
-    reset_variance_factor : float
-        Ratio of the position variance after a reset to the measurement variance of the sample.
-    resets_velocity : bool
-        True if velocity is reset together with position. Both are then reset after both were
-        rejected for ``reset_s``, or after position was rejected for twice that time.
+        Fusion stops after this number of resets in a row.
     min_bias_variance : float or None
-        Minimum of the accelerometer bias variance (m²/s⁴); None if the release has no minimum.
+        Minimum accelerometer bias variance (m²/s⁴).
     uses_delay_as_horizon : bool
-        True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
-        v1.15).
+        True if the largest delay parameter is the fusion horizon, not EKF2_DELAY_MAX (v1.15).
+    reset_variance_factor : float
+        Position variance after a reset ÷ measurement variance.
+    resets_velocity : bool
+        True if velocity is reset together with position.
     bad_acceleration_s : float
-        Time for which EKF2's flag for a bad vertical acceleration stays set.
+        Time for which the flag for a bad vertical acceleration stays set.
     """
 
     start_interval_s: float
@@ -177,30 +167,23 @@ class Inputs:
     Attributes
     ----------
     settings : dict
-        Logged values of the EKF2 parameters in the model, by PX4 name.
-    segments : tuple of ReplaySegment
+        EKF2 parameters in the model, by PX4 name.
     received : ReceivedPositions
-        Samples of the horizontal position source.
-    aid : Aid
-        EKF2's name and parameters of this position source: GNSS or external vision.
-    rules : FusionRules
-    step_s : float
-        Mean prediction step.
+        Samples of the horizontal position source ``aid``.
+    step_s, predict_s : float
+        Mean and configured prediction step.
     horizon_s : float
         Delay of the fusion horizon.
-    predict_s : float
-        Configured prediction interval, EKF2_PREDICT_US.
     vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
-        Position of the IMU, EKF2_IMU_POS, body FRD.
+        Position of the IMU (EKF2_IMU_POS, body FRD).
     max_interval_s : float
-        Maximum interval between height and heading measurements in a gap of the position source.
-    vision : ReceivedPositions or None
-        External vision that EKF2 fused in addition to GNSS; NaN while disabled.
+        Maximum interval between events in a gap of the position source.
     logged_height_reason : str
-        Reason why the replay of a flight with GNSS uses the logged EKF2 height; empty if it fuses
-        height sensors.
+        Reason why EKF2's logged height is used in a flight with GNSS.
+    vision : ReceivedPositions or None
+        Vision that EKF2 fused in addition to GNSS; NaN while disabled.
     """
 
     settings: dict[str, float]
@@ -223,13 +206,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 ) -> Inputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
-    Parameters
-    ----------
-    flight : Flight
-    doubtful_aids : mapping from PX4's name of an aiding source to str
-        Aiding sources with a replay that disagrees with the log, and the reasons. They are omitted:
-        height sensors are replaced by the logged EKF2 height; without optical flow the replay is
-        interrupted in gaps of the position source.
+    ``doubtful_aids`` are aiding sources, by PX4's name, that the model cannot reproduce, with the
+    reason. The replay omits them.
     """
     imu = flight.imu
     attitude = flight.attitude
@@ -335,8 +313,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         horizon_s=horizon_s,
         predict_s=predict_s(record),
         vision_height=not is_gnss
-        and isinstance(ekf2.fusing, pd.DataFrame)
-        and bool(ekf2.fusing["vertical"].mean() > 0.5),
+        and isinstance(ekf2.fusion_flags, pd.DataFrame)
+        and bool(ekf2.fusion_flags["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
         logged_height_reason=logged_height_reason,
@@ -345,10 +323,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples that are missing from the log, outside gaps.
-
-    ``time_s`` are the times of the logged samples.
-    """
+    """Return the fraction of IMU samples that are missing from the log, outside gaps."""
     intervals = np.diff(time_s)
     lost_counts = np.rint(intervals[intervals <= IMU_GAP_S] / np.median(intervals)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
@@ -356,7 +331,6 @@ def lost_imu_fraction(time_s: Array) -> float:
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    """Return Unavailable if too few IMU samples are logged; ``time_s`` are their times."""
     interval = float(np.median(np.diff(time_s)))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -364,7 +338,7 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_SHARE:
+    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
         return Unavailable(
             ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
@@ -393,8 +367,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             resets_together,
             bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
-    # sources of the times: EV_MAX_INTERVAL (ev_control.cpp); no_aid_timeout_max and
-    # reset_timeout_max (common.h)
+    # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     if not fuses_by_mask(record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
@@ -410,10 +383,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return the times at which an aiding source is enabled (1) or disabled (0).
-
-    None if the source was never enabled, or if this is not logged.
-    """
+    """Return the times at which a source is enabled (1) or disabled (0); None if never enabled."""
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -446,8 +416,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         is_enabled = step_values_at(enabled_log, samples.index) > 0.0
         samples = samples[is_enabled]
         velocities = velocities[is_enabled]
-    # the times of the track are measurement times: the delay is added, because the replay subtracts
-    # the delay again
+    # the track has measurement times, from which the replay subtracts the delay again
     flown_settings = effective_settings(parameters, GNSS_POS)
     flown_s = flown_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
@@ -474,9 +443,9 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
 def _position_corrections(
     ekf2: Ekf2, received: ReceivedPositions, settings: Mapping[str, float], aid: Aid
 ) -> Array | None:
-    """Estimate EKF2's position correction (m) by each sample from the published position.
+    """Return EKF2's position correction (m) by each sample, from the published position.
 
-    Return None if all rejections are logged, or none occurred.
+    None if all rejections are logged, or none occurred.
     """
     innovations = ekf2.innovations["north"]
     horizon_s = ekf2.horizon_s
@@ -494,8 +463,7 @@ def _position_corrections(
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # EKF2 publishes the correction with the prediction step that fuses the sample, at the latest
-    # one fusion horizon after the measurement, or on arrival of a sample that is late
+    # EKF2 fuses a sample when the fusion horizon reaches its measurement time, or on late arrival
     published_s = np.maximum(
         received.stamp_s - settings[aid.delay] * 1e-3 + horizon_s,
         received.arrival_s + 0.5 * ekf2.step_s,
@@ -509,7 +477,7 @@ def read_vision(
 ) -> ReceivedPositions | Unavailable:
     """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
-    ``attitude`` is the published attitude, which rotates positions in an FRD frame to NED.
+    The published ``attitude`` rotates positions from an FRD frame to NED.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -518,7 +486,9 @@ def read_vision(
     timestamp_s = samples.index.to_numpy()
     position = samples[Columns.POSITION].to_numpy(copy=True)
     variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    is_rotated_by_ekf2 = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
+    is_rotated_by_ekf2 = (
+        not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
+    )
     if fuses_by_mask(record.parameters):
         is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:
@@ -566,7 +536,7 @@ def _read_vision_besides_gnss(
     if fuses_by_mask(record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
-            f"{flight.log.firmware} fuses changes of the vision position besides GNSS, which the "
+            f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "
             "model does not contain",
             "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
         )
@@ -600,7 +570,7 @@ def _logged_decisions(
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
     may_reset = rejected_flags != 0.0
     may_reset[sample_row >= 0] |= logged["innovation_m"] == 0.0
-    # a reset is visible in the next published state, one fusion horizon later than the measurement
+    # a reset is published one fusion horizon after the measurement
     publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         earlier_rows = np.flatnonzero((publication_s <= reset_s) & may_reset)
@@ -613,7 +583,7 @@ def _logged_decisions(
 
 
 def aid_source(aid: Aid) -> str:
-    """Return the name of the uORB topic with the innovations of an aiding source."""
+    """Return the uORB topic with the innovations of an aiding source."""
     return f"estimator_aid_src_{aid.name}"
 
 

@@ -1,10 +1,9 @@
 """Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
 The output predictor propagates the delayed state to the present with the IMU. In each prediction
-step it compares the buffered output at the fusion horizon with the state. Velocity and position of
-the whole buffer are corrected by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
-recursion is linear with constant coefficients, so it is computed as a recursive (IIR) filter for a
-whole segment.
+step it compares its buffered output with the state at the fusion horizon, and corrects velocity and
+position by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This is a linear recursion,
+computed as a recursive (IIR) filter.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -31,15 +30,13 @@ from px4fuse.trajectory.rotation import rotate
 INTEGRAL_GAIN = 0.1
 # Time after which the effect of a position correction is neglected, in time constants τ
 MAX_TIME_CONSTANTS = 5.0
-# Weight of the prior "correction 0": without it, least squares could not separate two corrections
-# between the same two logged positions
+# Weight of the prior "correction 0", which separates corrections between two logged positions
 PRIOR_WEIGHT = 1e-3
-# Maximum interval between logged positions, in median intervals: in a longer interval positions are
-# missing
+# Positions are missing in an interval longer than this multiple of the median
 MAX_ROW_INTERVALS = 3.0
-# Minimum fraction of a position correction that is visible in the logged positions
-MIN_VISIBLE_SHARE = 0.5
-# Gain of the correction of the published attitude per fusion horizon delay (output_predictor.cpp)
+# A correction is estimated only if the logged positions show this fraction of it
+MIN_VISIBLE_FRACTION = 0.5
+# Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 
@@ -51,13 +48,13 @@ def publish(
     lag: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
-    """Return the published velocity and position at the end of each prediction step.
+    """Return the published velocity (m/s) and position (m) after each of n prediction steps.
 
     Parameters
     ----------
     segment : ReplaySegment
     state : ndarray, shape (n + 1, 15) or more
-        State at the fusion horizon; each row is at the time to which the state refers.
+        State at the fusion horizon.
     reset_m : ndarray, shape (n + 1, 3)
         Sum of position resets up to each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
@@ -65,12 +62,7 @@ def publish(
     lag : int
         Number of steps between fusion horizon and present.
     settings : mapping
-        Parameters by PX4 name, among them EKF2_TAU_VEL and EKF2_TAU_POS.
-
-    Returns
-    -------
-    velocity_m_s, position_m : ndarray, shape (n + 1, 3)
-        Published state. Before step ``lag`` it is dead reckoning from the first state.
+        EKF2 parameters by PX4 name.
     """
     step_s = segment.step_s[:, None]
     mean_step = float(np.mean(segment.step_s))
@@ -99,10 +91,10 @@ def publish(
 
 
 def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
-    """Return the sum c of all corrections with which the output follows the state.
+    """Return the sum of all corrections, with which the output follows the state.
 
-    ``offset`` is the state minus the output without corrections. In step k, with gain g and error
-    e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    ``offset`` o is the state minus the output without corrections. With gain g and error e_k =
+    o_(k-lag) - c_k, the sum of corrections is c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_GAIN * g**2
@@ -118,9 +110,8 @@ def corrections(
 ) -> Array:
     """Estimate EKF2's position correction by each sample from the published position.
 
-    At a time t after a correction, the published position contains the fraction 1 - exp(-t / τ) of
-    the correction, in addition to the integrated velocity. All corrections are estimated together
-    by least squares.
+    A correction appears in the published position as correction · (1 - exp(-t / τ)). All
+    corrections are estimated together by least squares.
 
     Parameters
     ----------
@@ -128,14 +119,14 @@ def corrections(
         Times of the published positions.
     velocity_m_s, position_m : ndarray, shape (n, a)
     sample_s : ndarray, shape (m,)
-        Increasing times, each one step before a correction becomes visible.
+        Start of each correction, increasing.
     tau_s : float
-        Time constant EKF2_TAU_POS.
+        EKF2_TAU_POS.
 
     Returns
     -------
     ndarray, shape (m, a)
-        Corrections (m) along a axes; NaN if logged positions are missing after the sample.
+        Corrections (m); NaN where logged positions are missing.
     """
     interval_s = np.diff(time_s)
     dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
@@ -158,37 +149,30 @@ def corrections(
         np.exp(-np.maximum(time_s[step] - sample_s[sample_index], 0.0) / tau_s)
         for step in (row, row + 1)
     )
-    visible_shares = csr_array(
+    visible_fractions = csr_array(
         (decay_start - decay_end, (row, sample_index)),
         shape=(len(correction_increments), len(sample_s)),
     )
-    normal_matrix = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
+    normal_matrix = visible_fractions.T @ visible_fractions + PRIOR_WEIGHT * eye_array(
+        len(sample_s)
+    )
     result = np.reshape(
-        spsolve(normal_matrix.tocsc(), visible_shares.T @ correction_increments),
+        spsolve(normal_matrix.tocsc(), visible_fractions.T @ correction_increments),
         (len(sample_s), -1),
     )
-    return np.where(visible_shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
+    return np.where(visible_fractions.sum(axis=0)[:, None] > MIN_VISIBLE_FRACTION, result, np.nan)
 
 
 def delay_by(values: Array, lag: int) -> Array:
-    """Delay values by ``lag`` prediction steps; the first value is repeated ``lag`` times."""
+    """Delay values by ``lag`` steps; the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
-    """Return the correction with which the published attitude follows the filter's attitude error.
+    """Return the sum of the attitude corrections of the output predictor.
 
-    Each prediction step corrects the newest attitude by the fraction 0.5 · step / horizon of the
-    attitude error at the fusion horizon.
-
-    Parameters
-    ----------
-    error_rad : ndarray, shape (n + 1, 3)
-        Attitude error at the fusion horizon (rotation vectors); each row is at the time to which
-        the error refers.
-    lag : int
-        Number of steps between fusion horizon and present.
-    step_s, horizon_s : float
+    Each step corrects the attitude by 0.5 · step / horizon of ``error_rad``, the attitude error at
+    the fusion horizon (rotation vectors, shape (n + 1, 3)).
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag + 2))

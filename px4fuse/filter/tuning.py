@@ -7,20 +7,19 @@ states for biases and needs a larger SIGMA_A, which is estimated separately.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
-    START_OUTLIER_WIDTH,
     NoiseFit,
     Noises,
     filter_positions,
@@ -32,7 +31,6 @@ from px4fuse.filter.likelihood import (
     innovations,
     preintegrate,
     profile_ends,
-    score_grid,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
@@ -40,14 +38,10 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Number of grid points along each side of the likelihood map
-GRID_SIZE = 40
-# Half-width of the likelihood map along each side, in σ of the estimate
-MAP_HALF_WIDTH_SIGMAS = 4.5
 # Minimum number of positions for an estimate of the noises
 MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
-MAX_OUTLIER_SHARE = 0.3
+MAX_OUTLIER_FRACTION = 0.3
 # Factors on KF's SIGMA_A for the initial values of the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
@@ -114,10 +108,6 @@ class AxisTuning(Record, frozen=True, kw_only=True):
         Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
         False if the IMU rate is too low; KF's SIGMA_A is then an upper bound of the noise.
-    name : str
-        Axis name, or "horizontal".
-    outlier_time_s : ndarray, shape (k,)
-        Timestamps of the outliers.
     noises : Noises
         Maximum-likelihood noises, including the random walk of a drifting source.
     """
@@ -244,7 +234,7 @@ def tune_axes(
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
-    if np.mean(is_outlier) > MAX_OUTLIER_SHARE:
+    if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             f"estimate of the noises ({name})",
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
@@ -319,41 +309,6 @@ def _noise_with_interval(
     )
     is_closed = low is not None and high is not None
     return Noise(value if is_inside and is_closed else None, low, high)
-
-
-def map_grids(tuning: AxisTuning) -> ArrayPair:
-    """Return SIGMA_A (m/s²) and SIGMA_Z (m) around their estimates, for a likelihood map."""
-    grids = []
-    for noise, fitted, (low, high) in (
-        (tuning.sigma_a_two_state, tuning.noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
-        (tuning.sigma_z, tuning.noises.sigma_z_m, SIGMA_Z_SEARCH_M),
-    ):
-        best_value = noise.value or noise.high or fitted
-        interval = np.array([noise.low or low, noise.high or high])
-        ends = best_value * (interval / best_value) ** (MAP_HALF_WIDTH_SIGMAS / 1.96)
-        lowest, highest = np.clip(ends, low, high)
-        grids.append(np.geomspace(lowest, highest, GRID_SIZE))
-    return grids[0], grids[1]
-
-
-def log_likelihood_drop(
-    tuning: AxisTuning,
-    axes: Iterable[Axis],
-    settings: Settings,
-    sigma_a_m_s2: Array,
-    sigma_z_m: Array,
-) -> Array:
-    """Return the decrease of KF's log-likelihood from its maximum on a grid.
-
-    Rows are SIGMA_A, columns SIGMA_Z.
-    """
-    names = ("north", "east") if tuning.name == HORIZONTAL else (tuning.name,)
-    tuned_axes = [axis for axis in axes if axis.name in names]
-    intervals = [preintegrate(axis, settings) for axis in tuned_axes]
-    time_s = tuned_axes[0].measurement_time_s[-len(intervals[0].measurement_m) :]
-    weight = np.where(np.isin(time_s, tuning.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
-    scores = score_grid(intervals, sigma_a_m_s2[:, None], sigma_z_m[None, :], weight)
-    return np.asarray(scores - scores.min())
 
 
 def _assess_innovations(

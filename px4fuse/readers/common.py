@@ -15,26 +15,24 @@ MAX_IMU_VALUE = 1e4
 # Minimum distance (m) of a position 0, 0, 0 from its neighbours to reject it as not measured: 3 σ
 # of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum duration (s) of equal positions to reject them as an old position that is sent again: a
-# source that sends each position several times repeats it for a shorter time
+# Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
+# sources that send each position several times repeat it for a shorter time
 MIN_HELD_S = 1.0
-# Minimum number of equal positions to reject them as an old position that is sent again
+# Minimum number of equal positions that the source repeats instead of measuring
 MIN_HELD_COUNT = 5
-# Maximum fraction of positions that are sent again: with more, the source is at rest and may repeat
-# its position
+# Maximum fraction of repeated positions to reject them: with more, the source may be at rest
 MAX_HELD_FRACTION = 0.5
-# Maximum deviation (rounding steps) of a difference of two values from a multiple of the rounding
-# step
+# Maximum deviation of a difference from a multiple of the rounding step, in rounding steps
 MAX_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return all :class:`Unavailable` in the data of a flight, also inside :class:`Ekf2`."""
+    """Return the descriptions of all missing data of a flight, also inside :class:`Ekf2`."""
     for data in flight_data:
         if isinstance(data, Ekf2):
-            flight_data += (data.variance, *data.innovations.values(), data.fusing)
+            flight_data += (data.variance, *data.innovations.values(), data.fusion_flags)
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
@@ -61,45 +59,43 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
 def finite_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
-    """Return the rows with all absolute values in ``columns`` below ``limit``, without NaN."""
+    """Return the rows in which all ``columns`` are finite and absolutely smaller than ``limit``."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
 def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return "NaN", "zero" or "held" for each row that is not a measurement, and "" for the others.
+    """Return the reason for each row that is not a measurement, and "" for all others.
 
-    ``columns`` are the coordinates that a measurement needs.
+    "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "held": the
+    last position is sent again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason = pd.Series("", index=samples.index)
     is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
     reason[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    others, zeros = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
-    if len(others):
-        after = np.searchsorted(others, zeros)
-        beside = others[np.clip([after - 1, after], 0, len(others) - 1)]
-        distance_m = np.linalg.norm(values[beside], axis=2).min(axis=0)
-        reason.iloc[zeros[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+    measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
+    if len(measured_rows):
+        next_index = np.searchsorted(measured_rows, zero_rows)
+        neighbours = measured_rows[np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)]
+        distance_m = np.linalg.norm(values[neighbours], axis=2).min(axis=0)
+        reason.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
     valid = np.flatnonzero(reason == "")
     is_same = np.all(np.diff(values[valid], axis=0) == 0.0, axis=1)
     starts = np.flatnonzero(np.append(True, ~is_same))
-    held = [
+    held_rows = [
         valid[start + 1 : end]
         for start, end in zip(starts, [*starts[1:], len(valid)], strict=True)
         if end - start >= MIN_HELD_COUNT and np.ptp(time_s[valid[start:end]]) >= MIN_HELD_S
     ]
-    if held and len(rows := np.concatenate(held)) < MAX_HELD_FRACTION * len(valid):
+    if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid):
         reason.iloc[rows] = "held"
     return reason
 
 
 def rounding_step(values: Array) -> float:
-    """Return the step of which all differences of the values are multiples.
-
-    Return 0 if there is no such step.
-    """
+    """Return the quantisation step of rounded values; 0 if the values are not rounded."""
     steps = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(steps):
         return 0.0
@@ -110,20 +106,14 @@ def rounding_step(values: Array) -> float:
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
-    """Interpolate a time series at times.
-
-    The result is NaN before the first and after the last sample.
-    """
+    """Interpolate a time series at times; NaN outside its time span."""
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
 def join_nearest(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
-    """Join each row with the row of ``other_samples`` that is nearest in time.
-
-    The added columns are NaN if no row is within the tolerance.
-    """
+    """Join each row with the nearest row in time of ``other_samples``; NaN beyond the tolerance."""
     return pd.merge_asof(
         samples,
         other_samples,
@@ -135,24 +125,15 @@ def join_nearest(
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a valid quaternion ``w, x, y, z``.
-
-    A quaternion with norm 0 means that the sender sent no attitude.
-    """
+    """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Return the orientation of each sample.
+    """Return the orientation of each sample with its variances; None if it never changes.
 
-    Return None if the orientation never changes.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        Columns ``w, x, y, z`` and optionally the variances ``forward_rad2, right_rad2,
-        down_rad2``, in which 0 means "not sent" (``EKF2.cpp``).
+    A variance of 0 becomes NaN: it means "not sent" (``EKF2.cpp``).
     """
     orientation = with_attitude(
         samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)

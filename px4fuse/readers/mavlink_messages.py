@@ -42,35 +42,31 @@ AUTOPILOT_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionInput:
-    """Message that sends an external position to the autopilot.
+    """Message that sends an external position to the autopilot."""
 
-    ``name`` is the track name for ``--position-source``, ``row`` the key in LAYOUTS, ``stamp`` the
-    field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any.
-    ``drops_covariance`` is True for a naive estimator, because PX4 ignores the covariance in its
-    message (``mavlink_receiver.cpp``).
-    """
-
+    # Key of the message in LAYOUTS
     row: str
     description: str
+    # Name of the track for ``--position-source``
     name: str = ""
     kind: str = "uwb"
+    # Field with the sender's time (µs)
     stamp: str = "time_usec"
+    # Required MAV_ESTIMATOR_TYPE, if any
     estimator: int | None = None
+    # True for a naive estimator: PX4 ignores its covariance (mavlink_receiver.cpp)
     drops_covariance: bool = False
 
     @property
     def layout(self) -> Layout:
-        """Fields of the message and the DataFrame columns to which they are converted."""
         return LAYOUTS[self.row]
 
     @property
     def origin(self) -> Origin:
-        """Kind of the position source, and data path of the positions from sender to log."""
         return find_origin(self.kind, "as received")
 
     @property
     def message(self) -> str:
-        """MAVLink name of the message."""
         return self.layout.topic
 
 

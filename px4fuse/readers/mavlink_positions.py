@@ -71,10 +71,7 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions in one message type from one sender.
-
-    Return None if the sender sent no such message.
-    """
+    """Read the positions in one message type from one sender, if it sent such messages."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -120,9 +117,7 @@ def _read_gnss(
 ) -> PositionTrack | Unavailable | None:
     """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
 
-    PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
-    next one. px4fuse selects GNSS by default only if the autopilot sends a global position. Return
-    None without messages.
+    The autopilot repeats each fix until the next one. Return None without messages.
     """
     rows = recording.rows(layout.topic)
     count = len(rows)
@@ -134,11 +129,11 @@ def _read_gnss(
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
-        few = "none" if fixes.empty else f"only {len(fixes)}"
+        fix_count = "none" if fixes.empty else f"only {len(fixes)}"
         return (
             px4_positions.unavailable(
                 layout.topic,
-                f"{count} messages, {few} with a 3D fix",
+                f"{count} messages, {fix_count} with a 3D fix",
                 "Give the antenna a free view of the sky and wait for a fix.",
             )
             if count

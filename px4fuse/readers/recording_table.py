@@ -38,37 +38,22 @@ _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 @dataclass(frozen=True)
 class Table:
-    """Table in a recording.
-
-    Attributes
-    ----------
-    file_name : str
-    format : str
-        Name of the format; "" for a table with a header.
-    names : list of str
-        Column names.
-    body : str
-        Text of the lines below the header.
-    separator : str
-    header_line : int or None
-        Line number of the header; 0 without a header, None if rows are not lines of the file.
-    frames : tuple of str
-        Frames that the format may have; empty for all.
-    rate_hz : float or None
-        Rate of the frame numbers that are in the time column; None for times.
-    is_one_body : bool
-        True if the columns belong to one body that was chosen from several.
-    notes : tuple of str
-    """
+    """Table of positions in a recording."""
 
     file_name: str
+    # Name of the format; "" for a table with a header
     format: str
     names: list[str]
+    # Text of the lines below the header
     body: str
     separator: str = ","
+    # Line number of the header; 0 without a header, None if rows are not lines of the file
     header_line: int | None = None
+    # Frames that the format may have; empty for all
     frames: tuple[str, ...] = ()
+    # Rate of the frame numbers in the time column; None for times
     rate_hz: float | None = None
+    # True if the columns belong to one body that was chosen from several
     is_one_body: bool = False
     notes: tuple[str, ...] = ()
 
@@ -127,7 +112,7 @@ def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) 
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose one with --body."
+        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose a body with --body."
     )
 
 
@@ -162,36 +147,36 @@ def find_table(
         text += f"{last_line}\n"
     elif last_line.strip():
         notes.append("the last line of the position file was dropped, because it has no line end")
-    found = None if columns else _find_json(file_name, text)
+    table = None if columns else _find_json(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
-    if columns is None and found is None:
-        found = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
+    if columns is None and table is None:
+        table = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
-    if found is None:
-        found = _find_header(file_name, text, lines, wanted_names)
-    if found is None and not wanted_names:
-        found = _find_numbers(path, text, lines)
-    if found is None:
+    if table is None:
+        table = _find_header(file_name, text, lines, wanted_names)
+    if table is None and not wanted_names:
+        table = _find_numbers(path, text, lines)
+    if table is None:
         title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{title_list}. The first line is {quote(lines[0])}.",
             f"Add a header such as time,x,y,z, or name the columns with {COLUMNS_OPTION}.",
         )
-    first_row = found.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
-    row_width = len(_split_line(first_row.rstrip(f"{found.separator} "), found.separator))
-    if row_width > len(found.names):
+    first_row = table.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+    row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
+    if row_width > len(table.names):
         raise LogError(
-            f"{file_name}: the header has {len(found.names)} columns, but the rows have "
+            f"{file_name}: the header has {len(table.names)} columns, but the rows have "
             f"{row_width}.",
             "Write numbers with decimal points, and give each column a name.",
         )
-    return replace(found, notes=(*found.notes, *notes))
+    return replace(table, notes=(*table.notes, *notes))
 
 
 def _is_complete(line: str, line_before: str) -> bool:
-    """Return True if a line without line end has the columns and decimals of the one before."""
+    """Return True if the last line has as many columns and decimals as the line before."""
     cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
     decimals, decimals_before = (one[-1].partition(".")[2] for one in (cells, cells_before))
     return "." in line and len(cells) == len(cells_before) and len(decimals) >= len(decimals_before)
@@ -238,23 +223,27 @@ def _find_groups(
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         row_by_title = {row[1]: row for row in rows[2:header]}
-        owners, kinds = (row_by_title.get(title, axes) for title in ("Name", "Type"))
-        used_kinds = {"Rigid Body"} if "Rigid Body" in kinds else {*kinds}
+        body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
+        used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
         # Rotations are not read, because the axes of a rigid body are not those of the vehicle
         names = [
-            f"{axis}_{unit}" if group == "Position" and kind in used_kinds else ""
-            for axis, group, kind in zip(axes, rows[header - 1], kinds, strict=False)
+            f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
+            for axis, group, body_type in zip(axes, rows[header - 1], body_types, strict=False)
         ]
     else:
-        owners = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
+        body_names = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
         names = [
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
             for axis, unit in zip(axes, rows[header + 1], strict=False)
         ]
         body = re.split(r"\n[, ]*\n", body.partition("\n")[2], maxsplit=1)[0] + "\n"
-    owners_with_position = (owner for owner, name in zip(owners, names, strict=False) if name)
-    chosen = choose_body(file_name, owners_with_position, wanted_body)
-    names = [name * (owner == chosen) for owner, name in zip(owners, names, strict=False)]
+    bodies_with_position = (
+        body_name for body_name, name in zip(body_names, names, strict=False) if name
+    )
+    chosen = choose_body(file_name, bodies_with_position, wanted_body)
+    names = [
+        name * (body_name == chosen) for body_name, name in zip(body_names, names, strict=False)
+    ]
     names[:2] = axes[:2] if is_motive else ["time", ""]
     return Table(
         file_name,
@@ -271,14 +260,14 @@ def _find_groups(
 
 
 def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
-    """Convert the lines of a stream that contain a position."""
+    """Convert the positions of a known stream format to a table."""
     for stream in STREAMS:
         pattern = re.compile(stream["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
         if first_row is not None:
             rows = pattern.findall(text)
             range_count = len(re.findall(stream["ranges"], first_row))
-            notes = [f"not used: {range_count} ranges beside each position"]
+            notes = [f"the {range_count} ranges beside each position are not used"]
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
             body = "".join(f"{','.join(row)}\n" for row in rows)
@@ -287,13 +276,15 @@ def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | Non
 
 
 def _find_json(file_name: str, text: str) -> Table | None:
-    """Convert JSON lines; names are the paths of the values, such as ``data.coordinates.x``."""
+    """Convert JSON lines to a table; column names are paths such as ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
     try:
         values = msgspec.json.Decoder().decode_lines(text)
     except msgspec.DecodeError as error:
-        raise LogError(f"{file_name} contains invalid JSON ({error})", "Record it again.") from None
+        raise LogError(
+            f"{file_name} contains invalid JSON ({error})", "Record the positions again."
+        ) from None
     records = [
         record for value in values for record in (value if isinstance(value, list) else [value])
     ]
@@ -339,7 +330,7 @@ def _without_comments(text: str) -> str:
 
 
 def _kitti_table(path: Path, text: str) -> Table:
-    """Read the rows of 3x4 matrices, and the times from a file in the same folder."""
+    """Read KITTI poses (rows of 3x4 matrices), and their times from a file in the same folder."""
     # imported on demand, as most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
@@ -359,7 +350,7 @@ def _kitti_table(path: Path, text: str) -> Table:
     except ValueError as error:
         raise LogError(
             f"{name}: the KITTI poses or the times in {display_name(times_path)} are not valid",
-            "Export both again.",
+            "Export poses and times again.",
         ) from error
     names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     note = f"the times are from {display_name(times_path)}"

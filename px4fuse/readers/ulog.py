@@ -79,7 +79,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED_TOPICS.items()
-            for table in topics.of(name)[:1]
+            for table in topics.tables_of(name)[:1]
         ),
     )
 
@@ -115,10 +115,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples, and record their topic as stream.
-
-    The result is Unavailable if the log contains fewer than two samples.
-    """
+    """Return the samples, or the reason why too few are in the log."""
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)

@@ -90,14 +90,9 @@ class _Content(io.BytesIO):
 
     pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
     byte, or to the next synchronisation message.
-
-    Attributes
-    ----------
-    skipped_bytes : int
-    start, end, position : int
-        Offsets of the last message header, of the end of the last read, and of the next read.
-        ``end`` and ``position`` may be after the end of the file.
     """
+
+    # offsets of the last message header, the end of the last read, and the next read
 
     skipped_bytes = start = end = position = 0
 
@@ -177,51 +172,36 @@ class _Reader(ULog):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Topics:
-    """Decoded topics of one log.
+    """Decoded topics of one log."""
 
-    Attributes
-    ----------
-    log : LogInfo
-        Log description, without notes on single topics (see :attr:`dropped`).
-    tables : mapping from (topic, instance) to mapping from PX4 field name to array
-    zero_us : int
-        Boot time (µs) at flight time zero.
-    dropped : dict
-        Number of samples with an invalid timestamp, by topic and instance; filled by
-        :meth:`read_instance`.
-    ekf2_parameters : mapping
-        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters in
-        the results.
-    is_cut : bool
-        True if the file ends within a message.
-    is_damaged : bool
-        True if pyulog skipped invalid bytes or messages.
-    streams : dict
-        Topics and clock of each kind of data in the flight; filled by :meth:`record_stream`.
-    parameter_changes : tuple of ParameterChange
-        Changes of EKF2_ parameters after take-off.
-    """
-
+    # Description of the log, without notes on single topics
     log: LogInfo
     tables: Tables
+    # Boot time (µs) at flight time zero
     zero_us: int
+    # Number of samples with an invalid timestamp, by topic and instance
     dropped: dict[tuple[str, int], int]
+    # All EKF2_ parameters at take-off; ``log`` contains only those in the results
     ekf2_parameters: Mapping[str, float]
+    # True if the file ends within a message
     is_cut: bool
+    # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
+    # Topics and clock of each kind of data in the flight
     streams: dict[str, Stream] = field(default_factory=dict)
+    # Changes of EKF2_ parameters after take-off
     parameter_changes: tuple[ParameterChange, ...] = ()
 
     def instances(self, topic: str) -> list[int]:
         """Return the sorted instance numbers of a topic with data."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def of(self, topic: str) -> list[Table]:
+    def tables_of(self, topic: str) -> list[Table]:
         """Return the tables of all instances of a topic, in order of the instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
-    def primary(self) -> Instances:
+    def primary_instances(self) -> Instances:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
@@ -234,12 +214,11 @@ class Topics:
         )
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are all in the log.
-
-        Return None if there is no such layout.
-        """
+        """Return the first layout whose required fields are all in the log, if any."""
         for layout in layouts:
-            if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
+            if any(
+                {*layout.columns.values()} <= table.keys() for table in self.tables_of(layout.topic)
+            ):
                 return layout
         return None
 
@@ -292,10 +271,7 @@ class Topics:
         )
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout whose fields are in the log, see :meth:`read_instance`.
-
-        Return an empty table if there is no such layout.
-        """
+        """Read the first layout whose fields are in the log, else return an empty table."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
 
@@ -320,8 +296,10 @@ class Topics:
         if self.find(layout) is None:
             return _empty_frame(layout)
         available = self.instances(layout.topic)
-        is_single = self.primary == NO_SELECTOR
-        switch_s, numbers = (np.array(values) for values in zip(*self.primary, strict=True))
+        is_single = self.primary_instances == NO_SELECTOR
+        switch_s, numbers = (
+            np.array(values) for values in zip(*self.primary_instances, strict=True)
+        )
         primary_frames: list[pd.DataFrame] = []
         for number in available[:1] if is_single else available:
             samples = self.read_instance(layout, number, step=step)
@@ -338,7 +316,7 @@ class Topics:
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
-            for table in self.of(topics[0])
+            for table in self.tables_of(topics[0])
         )
         event = "measurement" if has_measurement_time else "publication"
         self.streams[data_kind] = Stream(

@@ -35,8 +35,7 @@ from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimat
 MAX_SCALE_ERROR = 0.1
 # Minimum fraction of used poses, and of covered time of the reference, without a warning
 MIN_COVERAGE = 0.5
-# Minimum estimated time offset (s) for a warning that the clocks differ: the lag of a filter is
-# smaller
+# Minimum estimated time offset (s) for a warning that the clocks differ: a filter lags by less
 MIN_DOUBTFUL_OFFSET_S = 0.1
 # Maximum ratio of the pose intervals of reference and estimate: with a larger ratio, reference and
 # estimate are probably interchanged
@@ -223,15 +222,6 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
     exceeds 10 %. The reason for the choice is returned as a sentence.
-
-    Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
-    is aligned in rotation and position, and in scale if it is monocular or the scale factor error
-    exceeds 10 %.
-
-    Parameters
-    ----------
-    estimate, reference : Trajectory
-        Associated trajectories: the same number of poses, at the same times.
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
@@ -384,15 +374,15 @@ def _fit_or_approximate(
 def _move_to_reference_body(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Convert the poses of the estimate to the body of the reference.
+    """Convert the poses of the estimate to the body axes and the origin of the reference.
 
-    The constant rotation and the lever arm between both bodies are estimated, with the alignment.
+    Rotation and lever arm are constant, and are estimated together with the alignment.
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
-    arm_m, moved = np.zeros(3), estimate
+    arm_m, corrected = np.zeros(3), estimate
     for _ in range(ITERATIONS):
-        transform = fit_alignment(moved.position_m, reference.position_m, alignment)
+        transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
         body = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
@@ -401,7 +391,7 @@ def _move_to_reference_body(
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
         arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
         shift_m = (estimate.rotation * body).apply(arm_m) / transform.scale
-        moved = replace(
+        corrected = replace(
             estimate,
             position_m=estimate.position_m - shift_m,
             rotation=estimate.rotation * body,
@@ -409,7 +399,7 @@ def _move_to_reference_body(
     components = ", ".join(
         f"{value:+.2f} m along {axis}" for value, axis in zip(arm_m, "xyz", strict=True)
     )
-    return moved, (
+    return corrected, (
         f"The orientations differ by a constant {np.degrees(body.magnitude()):.1f}°: the estimate "
         "has other body axes than the reference, for example those of a camera. Its origin is at "
         f"{components} of the reference body. Both are corrected before the errors are computed.",
