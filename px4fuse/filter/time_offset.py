@@ -25,7 +25,7 @@ from px4fuse.filter.imu_motion import (
     SignalCache,
     prepare_motion,
 )
-from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
+from px4fuse.filter.likelihood import parabola_vertex, profile_interval
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -184,7 +184,7 @@ def estimate_time_offset(
         batches = prepared_motion.position_batches(nodes_s)
         totals = fit_noises(batches, noises, prepared_motion.weight).scores()[0]
         scores = CubicSpline(nodes_s, totals)(curve_s)
-        low_s, high_s = profile_interval(curve_s, scores, PROFILE_DROP)
+        low_s, high_s = profile_interval(curve_s, scores)
         is_closed = low_s is not None and high_s is not None
         if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
             break
