@@ -52,8 +52,8 @@ class Analysis(Comparison, Estimates, Reruns):
     @property
     def main_trials(self) -> list[Trial]:
         """Re-runs along the main axis; of EKF2 only if its replay agrees with the log."""
-        main = self.main.axis.name
-        return [trial for trial in self.trials if trial.axis == main and trial.is_logged]
+        main_axis = self.main.axis.name
+        return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
     @property
     def secondary_axes(self) -> list[AxisComparison]:

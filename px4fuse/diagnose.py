@@ -146,9 +146,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     LogError, MissingDataError, SettingsError
         A file cannot be read, or does not belong to the flight.
     """
-    log = Path(request.log)
-    progress(f"reading {display_name(log)}")
-    flight = read_log(log, system=request.system)
+    log_path = Path(request.log)
+    progress(f"reading {display_name(log_path)}")
+    flight = read_log(log_path, system=request.system)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight

@@ -848,7 +848,7 @@ def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
-        assert "± 2 %, 95 %" in finding.message
+        assert "± 2 % (95 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"

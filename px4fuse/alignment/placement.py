@@ -1,16 +1,11 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-The computer of a UWB system records with a separate clock and frame. The track of the file is
-matched with a reference in the log:
+The computer of a UWB system has a separate clock and frame. The track of the file is matched with
+EKF2's position or, if this is not suitable, with the acceleration integrated twice. The time offset
+is found by cross-correlation at all lags, and refined by robust least squares. It is relative to
+the reference: if EKF2 fused late positions, it includes their delay.
 
-1. EKF2's position;
-2. if EKF2's position is not suitable, the acceleration of the IMU integrated twice. Both tracks are
-   then band-pass filtered.
-
-Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
-The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
-refined by robust least squares. The time offset is relative to the reference: if EKF2 fused late
-positions, EKF2's position is late, and the time offset includes this delay.
+Horizontal positions are complex numbers, north + i·east: a rotation in yaw is a factor e^{i·yaw}.
 """
 
 from collections.abc import Iterator
@@ -281,10 +276,10 @@ def _compare_with_ekf2(
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
-    power = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
-    if power == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
+    norm_product = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m)) / power
+    return distance_m, float(np.sum(file_m * ekf2_m)) / norm_product
 
 
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:

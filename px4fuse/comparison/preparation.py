@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct, find_faults
+from px4fuse.convention.correction import correct_convention, find_faults
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
@@ -86,16 +86,14 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s
     settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
-    flight, track = correct(flight, track, convention)
+    flight, track = correct_convention(flight, track, convention)
     track = _move_to_vehicle(track, flight)
     track = _use_origin_of_gnss(track, flight)
     track = _use_barometer_height(track, flight, request.height)
     flight = select_innovations(flight, track)
     missing = flight.missing
     segment = choose_segment(flight, track, request.start_s, request.end_s)
-    names: tuple[str, ...] | None = request.axes or None
-    if names is None and track.origin.fused_as_gnss:
-        names = GNSS_AXES
+    names = request.axes or (GNSS_AXES if track.origin.fused_as_gnss else None)
     lines = make_axes(flight, track, segment, names=names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)

@@ -304,7 +304,7 @@ class BandedSystem:
         Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
         1/√Q₁₁; zero between segments.
-    bands, lower : ndarray, shape (2 + states, states · m)
+    bands, cholesky_factor : ndarray, shape (2 + states, states · m)
         Matrix A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
         ln|A| + Σ ln|Q| - Σ ln precision.
@@ -315,7 +315,7 @@ class BandedSystem:
     inverse_q: Array
     inverse_sqrt_q11: Array
     bands: Array
-    lower: Array
+    cholesky_factor: Array
     log_determinant: float
 
     @property
@@ -343,13 +343,13 @@ class BandedSystem:
             Component of the signals that the states explain.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
-        explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
+        explained, _ = lapack.dtbtrs(self.cholesky_factor, right_side.T, uplo="L", overwrite_b=1)
         return intervals, explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
         _, right_side = self._interval_sides(measured_m, dp, dv)
-        state, _ = lapack.dpbtrs(self.lower, right_side.T, lower=1, overwrite_b=1)
+        state, _ = lapack.dpbtrs(self.cholesky_factor, right_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
@@ -389,8 +389,8 @@ class BandedSystem:
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        (a, c) = (self.lower[0, first_row::2] for first_row in (0, 1))
-        b = self.lower[1, 0::2]
+        (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
+        b = self.cholesky_factor[1, 0::2]
         # the reversed order also exchanges position and velocity
         (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
@@ -473,12 +473,18 @@ def factorise(
         correlated[:-1, state_count] = -rho / correlated_variance[1:]
         log_noise += np.sum(np.log(correlated_variance))
     bands = columns.reshape(-1, state_count + 2).T
-    lower, is_singular = lapack.dpbtrf(bands, lower=1)
+    cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
         raise np.linalg.LinAlgError("a segment has too few positions to determine an initial state")
-    log_lower = 2.0 * np.sum(np.log(lower[0]))
-    log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
+    log_factor = 2.0 * np.sum(np.log(cholesky_factor[0]))
+    log_determinant = log_factor + log_noise - np.sum(np.log(precision[precision > 0.0]))
     inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(
-        precision, length_s, inverse_q, inverse_sqrt_q11, bands, lower, float(log_determinant)
+        precision,
+        length_s,
+        inverse_q,
+        inverse_sqrt_q11,
+        bands,
+        cholesky_factor,
+        float(log_determinant),
     )

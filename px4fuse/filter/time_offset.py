@@ -174,8 +174,8 @@ def estimate_time_offset(
             [motion.at(offset_s)], noises, motion.weight, outliers=False
         ).noises
         curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSETS)
-        totals = fit_noises(motion.position_batches(curve_s), noises, motion.weight).scores()[0]
-        offset_s, sigma_s = _minimum_and_sigma(curve_s, totals)
+        fit = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
+        offset_s, sigma_s = _minimum_and_sigma(curve_s, fit.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
     while True:
         nodes_s, curve_s = (
@@ -255,7 +255,7 @@ def _offset_per_part(
     grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSETS)
     profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
     part_offsets = []
-    drops = []
+    score_drops = []
     for begin, end, profile in zip(
         prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
     ):
@@ -263,10 +263,10 @@ def _offset_per_part(
         if sigma_s < MAX_PART_SIGMA_S:
             start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
-            drops.append(profile - profile.min())
+            score_drops.append(profile - profile.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    ratio = 2.0 * float(np.sum(drops, axis=0).min())
+    ratio = 2.0 * float(np.sum(score_drops, axis=0).min())
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, ratio))
 
 

@@ -209,15 +209,12 @@ def tune_axes(
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF's fit has no weight for the first measurement, its initial state
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
-        axis_directions = np.array([axis.direction for axis in axes])
-        time_s = axes[0].measurement_time_s
-        dt_s = settings.dt_s
         prepared_motion = prepare_motion(
             flight,
-            time_s,
+            axes[0].measurement_time_s,
             measured_m,
-            directions=axis_directions,
-            dt_s=dt_s,
+            directions=np.array([axis.direction for axis in axes]),
+            dt_s=settings.dt_s,
             weight=weight,
             signals=signals,
         )
@@ -273,8 +270,8 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
-        pair = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
-        sigma_a, sigma_z = np.exp(pair).tolist()
+        log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
+        sigma_a, sigma_z = np.exp(log_noises).tolist()
         return fit.score(Noises(sigma_a, sigma_z, fit.noises.random_walk_m))
 
     search_range = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]

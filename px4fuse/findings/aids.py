@@ -106,7 +106,7 @@ def detect_in_aids(
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
         is_barometer, effect = switch == BAROMETER.switch, ""
         if is_barometer and height_error_m is not None:
-            effect = f". EKF2's height error is {height_error_m:.2f} m"
+            effect = f": EKF2's height error is {height_error_m:.2f} m"
         yield finding(
             "note" if is_barometer and not effect else "warning",
             "aid_not_fused",

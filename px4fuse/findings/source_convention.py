@@ -133,7 +133,7 @@ def _position_faults(
     stated_frame = alignment.frame.upper() if alignment else "NED"
     axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
     is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
-    if faults.axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
+    if faults.has_wrong_axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
         orientation = convention.orientation
         limit = "The analysis uses the positions converted to NED."
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
@@ -142,7 +142,7 @@ def _position_faults(
         fault, action = describe_axes(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
         )
-        if faults.axes and turn_deg:
+        if faults.has_wrong_axes and turn_deg:
             fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
@@ -163,7 +163,7 @@ def _position_faults(
         if is_file:
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
-    if faults.unit:
+    if faults.has_wrong_unit:
         fault, action = describe_unit(convention.unit, positions, is_file=is_file)
         factor = convention.scale / UNITS[convention.unit]
         message = (

@@ -342,9 +342,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
         "source_outliers",
-        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
-        f"{format_metres(float(sizes_m.max()))} m ({format_percent(outlier_fraction, 1)}). Their "
-        f"median distance to {reference} is {format_metres(float(np.median(sizes_m)))} m. "
+        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} "
+        f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
+        f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
+        f"{format_metres(float(np.median(sizes_m)))} m. "
         f"Possible cause: {possible_cause}. KF has no gate and follows each "
         f"outlier.{_rejected(analysis, times_s)}",
         action,
