@@ -1,7 +1,5 @@
 """Records of an analysis: :mod:`px4fuse.diagnose` computes them from a request."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
