@@ -157,12 +157,11 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
-        f"EKF2's heading drifts by {change:+.0f}° relative to the "
-        f"{positions_of(analysis.source)}. Its error is {angles[0]:+.0f}° from "
-        f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
-        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
-        f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
-        f"{possible_cause}.",
+        f"EKF2's heading drifts by {change:+.0f}° relative to the {positions_of(analysis.source)}. "
+        f"Its error is {angles[0]:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s and "
+        f"{angles[1]:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, "
+        f"estimated from {basis}). A constant rotation of the positions cannot correct this. "
+        f"Possible cause: {possible_cause}.",
         f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,

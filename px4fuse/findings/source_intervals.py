@@ -131,8 +131,8 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     return finding(
         "error" if has_aids and not aids and duration_s > NOT_FUSED_LIMIT_S else "warning",
         "source_stops" if stops else "source_begins",
-        f"{positions_of(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
-        f"{aiding}KF, RMSE and verdicts do not include this time.",
+        f"{positions_of(source)} {event} in flight at {at_s:.1f} s{effect_text}. {aiding}KF, RMSE "
+        "and verdicts do not include this time.",
         f"Check {CHECKS[source.origin.kind]} {before_or_after} {at_s:.1f} s.{action}",
         {"at_s": at_s, "duration_s": duration_s, **at_end},
         (span_s,),

@@ -309,10 +309,9 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         yield finding(
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
             "source_scale_error",
-            f"{source_name(analysis.source)} distances are "
-            f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
-            f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
-            "Innovations do not show a scale factor error.",
+            f"{source_name(analysis.source)} distances are {format_percent(abs(excess))} too "
+            f"{'long' if excess > 0 else 'short'}. The comparison with the IMU is accurate to ± "
+            f"{format_percent(1.96 * sigma)} (95 %). Innovations do not show a scale factor error.",
             "Measure a known distance with the source. Then survey the anchors again, and check "
             "unit and calibration.",
             {"scale": 1.0 + excess, "sigma": sigma},
@@ -345,9 +344,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"{count} of {axis_tuning.count} {positions_of(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(sizes_m)))} m. "
-        f"Possible cause: {possible_cause}. KF has no gate and follows each "
-        f"outlier.{_rejected(analysis, times_s)}",
+        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {possible_cause}. KF has "
+        f"no gate and follows each outlier.{_rejected(analysis, times_s)}",
         action,
         {
             "count": count,
