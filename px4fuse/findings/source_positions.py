@@ -479,7 +479,7 @@ def hardly_moved(comparison: Comparison) -> bool:
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
-    """Detect too little motion to identify velocity, heading and time offset."""
+    """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = motion_range_m(analysis)
     if hardly_moved(analysis):
         yield warning(
