@@ -67,8 +67,6 @@ class SourceWords(Record, frozen=True):
     outliers: str
     outliers_action: str
     reception: str
-    noise: str
-    unequal_axes_action: str
     scale: str
     errors: str
 

@@ -332,7 +332,8 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
-            f"Measure a known distance with the source. {source_words(analysis.source).scale}.",
+            "Measure a known distance with the source. Then check "
+            f"{source_words(analysis.source).scale}.",
             {"scale": 1.0 + excess, "sigma": sigma},
         )
 
