@@ -41,7 +41,6 @@ from px4fuse.filter.marginal_likelihood import (
     expected_squares,
     factorise,
     fit_positions,
-    products_by_segment,
 )
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.settings import Settings
@@ -275,28 +274,6 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         found_values, count = expected_squares(*arranged, constants)
         np.testing.assert_allclose(found_values, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
-
-
-def test_products_with_banded_covariance_equal_dense_products() -> None:
-    part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
-    signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
-    still = np.zeros((3, 2, COUNT - 1))
-    first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
-    given = arguments(part, noises, np.ones(COUNT))
-    found_values = products_by_segment(*given, (first, still, still), second)
-    # a path that agrees with the increments has no effect
-    legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
-    path, speed = np.zeros((2, *first.shape))
-    for at in np.flatnonzero(part.is_joined):
-        path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
-        speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
-    moved = products_by_segment(*given, (first + path, *legs), second)
-    np.testing.assert_allclose(moved, found_values, rtol=1e-3, atol=1e-3)
-    for stretch in range(2):
-        _, covariance, made = joint_normal(part, noises, given[2], stretch)
-        picked = np.concatenate([signal[rows, axis] for axis, (rows, *_) in enumerate(made)])
-        expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(found_values[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
 def test_subtracting_imu_path_from_positions_keeps_likelihood() -> None:

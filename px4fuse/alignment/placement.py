@@ -278,10 +278,10 @@ def _compare_with_ekf2(
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
-    power = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
-    if power == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
+    norm_product = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m)) / power
+    return distance_m, float(np.sum(file_m * ekf2_m)) / norm_product
 
 
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:

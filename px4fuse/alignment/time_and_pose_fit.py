@@ -172,8 +172,10 @@ def fit_by_least_squares(
     centre_m = np.mean(file_m)
     # with a centred track, the errors of yaw and origin are uncorrelated
     file_m = file_m - centre_m
-    power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
-    coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
+    std_product = float(np.sqrt(np.var(file_m) * np.var(target_m)))
+    coherence = (
+        complex(np.vdot(file_m, target_m) / len(file_m) / std_product) if std_product > 0 else 0j
+    )
     mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
     horizontal = reference.horizontal_m
 
@@ -221,7 +223,7 @@ def fit_by_least_squares(
     concordance = peak.concordance
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
-        concordance = real_covariance * power / mean_square if power > 0 else 0.0
+        concordance = real_covariance * std_product / mean_square if std_product > 0 else 0.0
     origin = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,

@@ -368,9 +368,9 @@ def _closing_sentence(
 ) -> str:
     if alternatives:
         return (
-            "Take only one of these actions: both correct the same time offset. Their signs "
-            "differ: --clock-offset (s) is added to the timestamps of this log, the delay "
-            "parameter (ms) is the age of a position."
+            "Take only one of these actions: both correct the same time offset, with opposite "
+            "signs. --clock-offset (s) is added to the timestamps, the delay parameter (ms) is "
+            "the age of a position."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises, and with the estimated noises."

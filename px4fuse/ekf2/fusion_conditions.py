@@ -155,7 +155,7 @@ def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
 
 
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a source are constant, so that they are no measurement."""
+    """Return True if x and y of a source are constant: only its height is measured."""
     return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
 
 

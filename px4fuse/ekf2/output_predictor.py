@@ -164,7 +164,7 @@ def corrections(
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:
-    """Delay values by ``lag`` steps; the first value is repeated."""
+    """Delay values by ``lag_steps``; the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 

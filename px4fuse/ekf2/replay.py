@@ -216,7 +216,7 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Spans (s) of the replay without the first seconds and without times of flow only."""
+        """Spans (s) of the replay, without the first seconds and times with optical flow only."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S

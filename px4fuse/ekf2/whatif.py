@@ -167,9 +167,9 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     def position_rmse_to_truth_m(self) -> float | Unavailable:
         """Horizontal RMSE of the published position against ground truth (m)."""
         north_m, east_m = self.north.position_rmse_to_truth_m, self.east.position_rmse_to_truth_m
-        if isinstance(north_m, Unavailable) or isinstance(east_m, Unavailable):
-            return NO_TRUTH
-        return float(np.hypot(north_m, east_m))
+        if isinstance(north_m, Unavailable):
+            return north_m
+        return east_m if isinstance(east_m, Unavailable) else float(np.hypot(north_m, east_m))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
-"""KF for grids of settings: innovations, likelihood and 95 % intervals.
+"""KF with one prediction per position measurement, and 95 % intervals from the likelihood.
 
-The input is integrated between position measurements, so KF needs one prediction per measurement
-instead of one per DT. All settings of a grid are computed together as an array. For SIGMA_A and
-SIGMA_Z of at least 1e-3 the results equal those of :func:`px4fuse.filter.kalman.replay` to 1e-9.
+The input is integrated between measurements, so KF does not need one prediction per DT. With SIGMA_A
+and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from __future__ import annotations
@@ -189,21 +188,18 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     return (0.5 * (left_value - right_value) / curvature if curvature > 0.0 else 0.0), curvature
 
 
-def profile_interval(
-    grid: Array, profile: Array, max_drop: float = PROFILE_DROP
-) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of a parameter; None for an end outside the grid.
+def profile_interval(grid: Array, profile: Array) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of a parameter from its negative log-likelihood on a grid.
 
-    ``profile`` is the negative log-likelihood on the grid; it increases by ``max_drop`` from its
-    minimum to the ends of the interval.
+    An end outside the grid is None.
     """
     drop = profile - profile.min()
-    first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
+    first_index, last_index = np.flatnonzero(drop <= PROFILE_DROP)[[0, -1]]
 
     def interpolate_end(inside_index: int, outside: int) -> float | None:
         if not 0 <= outside < len(grid):
             return None
-        fraction = (max_drop - drop[inside_index]) / (drop[outside] - drop[inside_index])
+        fraction = (PROFILE_DROP - drop[inside_index]) / (drop[outside] - drop[inside_index])
         return float(grid[inside_index] + fraction * (grid[outside] - grid[inside_index]))
 
     return interpolate_end(first_index, first_index - 1), interpolate_end(

@@ -94,7 +94,8 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
-    message = capitalise_first(message)
+    if message[1:2] != " ":  # "x and y are exchanged" begins with an axis
+        message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 

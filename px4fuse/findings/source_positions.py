@@ -361,9 +361,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
         "source_outliers",
-        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
-        f"{format_metres(float(sizes_m.max()))} m ({format_percent(outlier_fraction, 1)}). Their "
-        f"median distance to {reference} is {format_metres(float(np.median(sizes_m)))} m. "
+        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} "
+        f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
+        f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
+        f"{format_metres(float(np.median(sizes_m)))} m. "
         f"Possible cause: {words.outliers}. KF has no gate and follows each "
         f"outlier.{_rejected(analysis, times_s)}",
         words.outliers_action,
@@ -479,7 +480,7 @@ def hardly_moved(comparison: Comparison) -> bool:
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
-    """Detect too little motion to identify velocity, heading and time offset."""
+    """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = motion_range_m(analysis)
     if hardly_moved(analysis):
         yield warning(

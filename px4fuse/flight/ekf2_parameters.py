@@ -32,7 +32,7 @@ class Aid:
     noise_mode: str = ""
     # Parameters for the position of the sensor (m, FRD)
     lever_arm: tuple[str, ...] = ()
-    # Name for users
+    # Printed name
     label: str = ""
     # Unit of the innovations
     unit: str = "m"

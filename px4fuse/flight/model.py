@@ -309,9 +309,9 @@ class FusionRecord:
     # Measured magnetic field (body FRD), ``fused_3d`` (1 while EKF2 fuses all components, 0 for
     # heading only) and, since v1.16, EKF2's low-pass filtered innovations (expected minus measured)
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow, low-pass filtered with FLOW_FILTER_WEIGHT (body FRD): each row is
-    # a weighted mean of ``samples`` values at intervals of ``interval_s``; ``noise_m2_s2`` is R of
-    # each value
+    # Velocity from optical flow (body FRD). Each row is the mean of ``samples`` measurements at
+    # intervals of ``interval_s``, weighted as in EKF2's low-pass filter (FLOW_FILTER_WEIGHT);
+    # ``noise_m2_s2`` is the variance R of one measurement
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin
     latitude_deg: float = np.nan
@@ -356,7 +356,7 @@ class AidLog:
     # Number of innovations that were dropped because no variance is near in time
     excluded_count: int = 0
     # Times of innovations for which the log does not show whether EKF2 fused them
-    unjudged_s: Array = field(default_factory=lambda: np.zeros(0))
+    unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 

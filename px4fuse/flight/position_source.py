@@ -54,9 +54,10 @@ class Origin(Record, frozen=True):
 
     @property
     def is_gnss(self) -> bool:
-        """True for GNSS, whose multipath and atmospheric errors are correlated over minutes.
+        """True for GNSS.
 
-        R must be larger than the variance estimated from differences of consecutive positions.
+        Multipath and atmospheric errors are correlated over minutes, so R must be larger than the
+        variance of the differences of consecutive positions.
         """
         return self.kind == "gnss"
 

@@ -114,8 +114,9 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     if len(rows) < 2:
         reason = "the recording contains no HIGHRES_IMU or SCALED_IMU"
         if raw_count := len(recording.rows("RAW_IMU")):
-            raw_note = f"{raw_count} RAW_IMU messages are not used, because raw counts have no unit"
-            reason = f"{reason}; {raw_note}"
+            reason += (
+                f"; {raw_count} RAW_IMU messages are not used, because raw counts have no unit"
+            )
         return Unavailable("IMU", reason, remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):

@@ -44,7 +44,7 @@ MIN_VALID_FRACTION = 0.01
 # receive time with a larger difference is damaged
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
-    message.msgname: at for at, message in dialect.mavlink_map.items()
+    message.msgname: number for number, message in dialect.mavlink_map.items()
 }
 # Vehicle type by number of the MAV_TYPE: "quadrotor" for MAV_TYPE_QUADROTOR
 VEHICLE_TYPES = {
@@ -313,12 +313,12 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 
 
 def _read_receive_times(
-    source: NDArray[np.uint8], start: Integers, end: Integers
+    content_bytes: NDArray[np.uint8], start: Integers, end: Integers
 ) -> tuple[Integers, int]:
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES
-    windows = np.lib.stride_tricks.sliding_window_view(source, RECEIVE_TIME_BYTES)
+    windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
     raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
         :, 0

@@ -72,12 +72,12 @@ def read_positions(
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
-    turns = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
+    is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
             *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
-            _read_ev_pos_aid(topics, turns),
-            _reconstruct(topics, ekf2, turns),
+            _read_ev_pos_aid(topics, is_odometry),
+            _reconstruct(topics, ekf2, is_odometry),
             _read_gps(topics, ekf2),
         ]
     )
@@ -154,12 +154,12 @@ def _make_ulog_track(
     samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
-    turns: bool = False,
+    is_odometry: bool = False,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a ULog track; ``turns`` is True if the source sends a changing orientation."""
+    """Make a ULog track; ``is_odometry`` is True if its source sends a changing orientation."""
     source = px4.TRACKS[name]
-    origin = with_orientation(source.origin, is_changing=turns)
+    origin = with_orientation(source.origin, is_changing=is_odometry)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
@@ -177,9 +177,9 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
     frame = "unknown"
-    for field, names in px4.FRAMES.items():
+    for field, frame_names in px4.FRAMES.items():
         if field in samples and len(samples):
-            frame = names.get(int(samples[field].iloc[-1]), "unknown")
+            frame = frame_names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # EKF2 rotated the positions, but the field still contains the old frame
     if "published_us" in samples:
@@ -198,7 +198,7 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         samples,
         (layout.topic,),
         notes=notes,
-        turns=orientation is not None,
+        is_odometry=orientation is not None,
         frame=frame,
         clock_map=_arrival_clock_map(topics, layout.topic),
         orientation=orientation,
@@ -237,7 +237,9 @@ def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     if not sampled_us.any():
         return "0"
     rate = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
-    units = [name for name, us in STAMP_UNITS.items() if abs(rate / us - 1.0) < MAX_RATE_ERROR]
+    units = [
+        name for name, unit_us in STAMP_UNITS.items() if abs(rate / unit_us - 1.0) < MAX_RATE_ERROR
+    ]
     if not units:
         return "an unknown clock"
     stamp_s = float(np.median(sampled_us)) * STAMP_UNITS[units[0]] * 1e-6
@@ -246,17 +248,17 @@ def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     return units[0] if units[0] != "microseconds" else "another clock"
 
 
-def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
+def _read_ev_pos_aid(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
         return unavailable(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
     samples = topics.primary_samples(layout)
     used_topics = [layout.topic]
     notes: tuple[str, ...] = ()
-    vertical = topics.find(px4.LAYOUTS["kept_vertical"])
-    if vertical is not None:
-        samples, notes = _with_height(samples, topics.primary_samples(vertical))
-        used_topics.append(vertical.topic)
+    vertical_layout = topics.find(px4.LAYOUTS["kept_vertical"])
+    if vertical_layout is not None:
+        samples, notes = _with_height(samples, topics.primary_samples(vertical_layout))
+        used_topics.append(vertical_layout.topic)
     # EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
     samples = _shift_times(samples, _delay_s(topics) + 0.5 * configured_step_s(topics))
@@ -265,7 +267,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
         px4.FUSED_OBSERVATION,
         samples,
         tuple(used_topics),
-        turns=turns,
+        is_odometry=is_odometry,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
     )
@@ -298,7 +300,7 @@ def _delay_s(topics: Topics) -> float:
 
 
 def _reconstruct(
-    topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool
+    topics: Topics, ekf2: Ekf2 | Unavailable, is_odometry: bool
 ) -> PositionTrack | Unavailable:
     """Reconstruct the source's positions as EKF2 position plus innovation.
 
@@ -324,7 +326,7 @@ def _reconstruct(
         px4.RECONSTRUCTION,
         _shift_times(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
-        turns=turns,
+        is_odometry=is_odometry,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
         clock=f"time of the innovation plus {EV_POS.delay}, up to one sample interval late",
@@ -490,24 +492,24 @@ def read_truth(
     differs from the origin of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
-    local, in_degrees = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
-    logged_local = topics.read(local)
+    local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
+    logged_local = topics.read(local_layout)
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(in_degrees), GLOBAL_COLUMNS[:2])
+    global_positions = finite_rows(topics.read(global_layout), GLOBAL_COLUMNS[:2])
     if len(global_positions):
         projected = project_to_ned(global_positions, _local_origin(topics))
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
-            return Truth(in_degrees.topic, projected.join(velocity), attitude)
+            return Truth(global_layout.topic, projected.join(velocity), attitude)
         if fused_aid(ekf2):
             local_samples = _move_to_origin(local_samples, projected)
     if len(local_samples):
-        return Truth(local.topic, local_samples, attitude)
+        return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
-            f"{local.topic} has no finite sample",
+            f"{local_layout.topic} has no finite sample",
             "Check the simulation that writes the ground truth.",
         )
     return mocap_truth or Unavailable(

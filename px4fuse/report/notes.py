@@ -43,10 +43,10 @@ def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults
 
 
 def write(page: Page, notes: str) -> None:
-    """Write Markdown on a page as plain text.
+    r"""Write Markdown on a page as plain text.
 
     >>> page = Page()
-    >>> write(page, "# A *b*\\n\\n- σ_z² is `R`\\n\\n![a map](m.png)")
+    >>> write(page, "# A *b*\n\n- σ_z² is `R`\n\n![a map](m.png)")
     >>> [block["text"] for block in page.blocks]
     ['A b', 'σ_z² is R', '[picture: a map]']
     """

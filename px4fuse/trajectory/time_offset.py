@@ -241,13 +241,13 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
         correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
     mean_correlation = np.mean(correlations, axis=0)
     local_maximum = maximum_filter1d(mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1)
-    order = np.flatnonzero(
+    peak_indices = np.flatnonzero(
         (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
     )
-    order = order[np.argsort(-mean_correlation[order])][:MAX_CANDIDATES]
+    peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
     # At index k the first sample of sparse is at sample k - (n - 1) of dense
     lags_s = (
-        (order - (len(is_known_sparse) - 1)) * step_s
+        (peak_indices - (len(is_known_sparse) - 1)) * step_s
         + float(dense_track.time_s[0])
         - float(sparse_track.time_s[0])
     )

@@ -49,12 +49,12 @@ class PoseGraph:
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
         """Return the graph with only the edges in the mask, shape (m,)."""
-        edges = ("first", "second", "measurements", "information")
-        return replace(self, **{name: getattr(self, name)[is_selected] for name in edges})
+        edge_fields = ("first", "second", "measurements", "information")
+        return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Length of a tangent: 3 in the plane, 6 in space."""
+        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
     @property
@@ -125,10 +125,12 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    ends = (graph.first[is_informative], graph.second[is_informative])
-    n = len(graph)
-    links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
-    component_count, component = connected_components(links, directed=False)
+    connected_nodes = (graph.first[is_informative], graph.second[is_informative])
+    node_count = len(graph)
+    adjacency = sparse.coo_array(
+        (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
+    )
+    component_count, component = connected_components(adjacency, directed=False)
     if component_count > 1:
         other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
         raise TrajectoryError(
