@@ -9,13 +9,10 @@ whole segment.
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csr_array, eye_array
-from scipy.sparse.linalg import spsolve
 
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay_segments import (
@@ -29,16 +26,6 @@ from px4fuse.trajectory.rotation import rotate
 
 # Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Time after which the effect of a position correction is neglected, in time constants τ
-MAX_TIME_CONSTANTS = 5.0
-# Weight of the prior "correction 0": without it, least squares could not separate two corrections
-# between the same two logged positions
-PRIOR_WEIGHT = 1e-3
-# Maximum interval between logged positions, in median intervals: in a longer interval positions are
-# missing
-MAX_ROW_INTERVALS = 3.0
-# Minimum fraction of a position correction that is visible in the logged positions
-MIN_VISIBLE_SHARE = 0.5
 # Gain of the correction of the published attitude per fusion horizon delay (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
@@ -111,63 +98,6 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
         np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), delayed_offset
     )
     return np.asarray(correction_sum + offset[0])
-
-
-def corrections(
-    time_s: Array, velocity_m_s: Array, position_m: Array, sample_s: Array, tau_s: float
-) -> Array:
-    """Estimate EKF2's position correction by each sample from the published position.
-
-    At a time t after a correction, the published position contains the fraction 1 - exp(-t / τ) of
-    the correction, in addition to the integrated velocity. All corrections are estimated together
-    by least squares.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Times of the published positions.
-    velocity_m_s, position_m : ndarray, shape (n, a)
-    sample_s : ndarray, shape (m,)
-        Increasing times, each one step before a correction becomes visible.
-    tau_s : float
-        Time constant EKF2_TAU_POS.
-
-    Returns
-    -------
-    ndarray, shape (m, a)
-        Corrections (m) along a axes; NaN if logged positions are missing after the sample.
-    """
-    interval_s = np.diff(time_s)
-    dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
-    correction_increments = np.diff(position_m, axis=0) - dead_reckoned
-    usual_s = float(np.median(interval_s))
-    is_usable = np.isfinite(correction_increments).all(axis=1) & (
-        interval_s < MAX_ROW_INTERVALS * usual_s
-    )
-    correction_increments[~is_usable] = 0.0
-    row_count = math.ceil(MAX_TIME_CONSTANTS * tau_s / usual_s) + 1
-    row = np.searchsorted(time_s, sample_s, side="right") - 1 + np.arange(row_count)[:, None]
-    is_inside = (
-        (row >= 0)
-        & (row < len(correction_increments))
-        & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
-    )
-    row = row[is_inside]
-    sample_index = np.nonzero(is_inside)[1]
-    decay_start, decay_end = (
-        np.exp(-np.maximum(time_s[step] - sample_s[sample_index], 0.0) / tau_s)
-        for step in (row, row + 1)
-    )
-    visible_shares = csr_array(
-        (decay_start - decay_end, (row, sample_index)),
-        shape=(len(correction_increments), len(sample_s)),
-    )
-    normal_matrix = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
-    result = np.reshape(
-        spsolve(normal_matrix.tocsc(), visible_shares.T @ correction_increments),
-        (len(sample_s), -1),
-    )
-    return np.where(visible_shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
 
 
 def delay_by(values: Array, lag: int) -> Array:

@@ -77,8 +77,10 @@ MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # the gate limit changes many later samples: then only rejected fraction and mean NIS are compared,
 # and single innovations in a second replay with the logged rejections
 MANY_REJECTIONS_SHARE = 0.05
-# Minimum rejected fraction for blaming the resets in a log for a replay that does not agree with it
+# Rejected fraction above which EKF2's position is mostly integrated from the IMU: the published
+# position is then not tested, but the innovations must agree better
 MOSTLY_REJECTED_SHARE = 0.5
+MIN_IMU_CORRELATION = 0.99
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
@@ -610,34 +612,36 @@ def _format_beyond(value: float, limit: float) -> str:
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def with_logged_rejections(
-    agreement: Agreement, logged_rejections_agreement: Agreement, *, has_all_decisions: bool
-) -> Agreement:
-    """Return the agreement with the verdict (good, reason) from a replay with logged rejections.
+def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> Agreement:
+    """Return the agreement of a replay with EKF2's logged decisions.
 
     With many rejections one sample near the gate limit makes the replay differ from the log,
     although the filter equations are the same.
 
     Parameters
     ----------
-    agreement, logged_rejections_agreement : Agreement
-        Agreement of the replay with the model's gate, and of the replay with logged rejections.
-    has_all_decisions : bool
-        True if every decision of EKF2 is logged. Then all numbers are from
-        ``logged_rejections_agreement``.
+    agreement, with_decisions : Agreement
+        Agreement of the replay with the model's gate, and of the replay with logged decisions.
     """
-    is_good, reason = _agreement_verdict(
-        logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
-    )
-    reason = f"with EKF2's logged rejections: {reason}"
-    if not is_good and agreement.rejected_fraction_logged > MOSTLY_REJECTED_SHARE:
+    rejected = agreement.rejected_fraction_logged
+    relies_on_imu = rejected > MOSTLY_REJECTED_SHARE
+    published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
+    is_good, reason = _agreement_verdict(with_decisions.axes, 0.0, 0.0, published_factor)
+    correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
+    if is_good and relies_on_imu and correlation < MIN_IMU_CORRELATION:
+        is_good = False
         reason = (
-            f"EKF2 rejected {agreement.rejected_fraction_logged:.0%} of the positions and used the "
-            "IMU, with a reset after each second. The log does not show which sample each reset "
-            "used. The frame of the source is probably wrong"
+            f"the correlation {correlation:.4f} of replayed and logged innovations is below the "
+            f"minimum of {MIN_IMU_CORRELATION:g}"
+        )
+    reason = f"with EKF2's logged rejections: {reason}"
+    if relies_on_imu and not is_good:
+        reason += (
+            f". EKF2 rejected {rejected:.0%} of the positions and relied on the IMU. The frame of "
+            "the source is probably wrong"
         )
     return replace(
-        logged_rejections_agreement if has_all_decisions else agreement,
+        with_decisions,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,

@@ -313,6 +313,7 @@ RECORD_NOT_LOGGED = Unavailable(
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+DEAD_RECKONING = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
@@ -354,9 +355,11 @@ class FusionRecord:
     height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 4)
         Updates of the height of the aid minus height of the reference: ``bias_m`` and its variance
         ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``.
-    states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
-        Step functions: 1 while EKF2 detects ground effect on the barometer, or wrong vertical
-        acceleration; otherwise 0. Contains logged states only.
+    states : mapping from str to Series
+        Step functions: 1 while EKF2 detects ground effect on the barometer
+        (:data:`GROUND_EFFECT`) or wrong vertical acceleration (:data:`BAD_ACCELERATION`), or
+        reports inertial dead reckoning (:data:`DEAD_RECKONING`); otherwise 0. Contains logged
+        states only.
     """
 
     parameters: Mapping[str, float]
@@ -402,9 +405,10 @@ class AidLog:
         Indexed by measurement time, for each axis: ``innovation_<axis>`` (measurement minus
         prediction) and ``variance_<axis>`` (S). From ``estimator_aid_src`` topics also
         ``noise_<axis>`` (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0),
-        for external vision position and barometer ``observation_<axis>``, and for the barometer
-        ``filtered_down`` (prediction minus measurement, low-pass filtered). In the unit of the aid
-        or its square.
+        for external vision position and barometer ``observation_<axis>``, for the barometer
+        ``filtered_down`` (prediction minus measurement, low-pass filtered), and for positions
+        ``last_fused_s``, the time of the last fusion or reset. In the unit of the aid or its
+        square.
     enabled : Series or None
         Step function: 1 while fusion of the source is enabled, otherwise 0; None if not logged.
     parameters : mapping
