@@ -23,18 +23,10 @@ from px4fuse.request import ComparisonRequest
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison, Estimates, Reruns):
-    """Comparison of KF and EKF2, with estimates, re-runs and findings that explain it.
+    """Comparison of KF and EKF2, with estimates, re-runs and findings.
 
     Attributes
     ----------
-    flight, source, source_reason, segment, settings, lines, notes, missing, axes, horizontal
-        See :class:`~px4fuse.comparison.model.Comparison`.
-    tuning, clock, heading, bias_scale_jump_fit, source_low_pass, time_correlated_noise
-        See :class:`~px4fuse.comparison.estimates.Estimates`.
-    ekf2_model, difference_steps, trials
-        See :class:`~px4fuse.comparison.causal_replays.Reruns`.
-    events : Events
-        Gaps, rejections, resets and flight modes, for time plots.
     aids : mapping from PX4's name to AidResult, or Unavailable
         Innovation statistics of each aiding source of EKF2.
     loop : Loop or Unavailable
@@ -42,7 +34,6 @@ class Analysis(Comparison, Estimates, Reruns):
     findings : tuple of Finding
         Findings about the flight, most severe first, each cause followed by its effects.
     request : ComparisonRequest or None
-        None if the analysis was made from a comparison, not from a request.
     """
 
     events: Events
@@ -62,7 +53,7 @@ class Analysis(Comparison, Estimates, Reruns):
 
     @property
     def main_trials(self) -> list[Trial]:
-        """Re-runs of KF and EKF2 along the main axis whose statistics as flown are from the log."""
+        """Re-runs along the main axis; of EKF2 only if its replay agrees with the log."""
         main = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main and trial.is_logged]
 
@@ -100,18 +91,14 @@ class WhatIfAnalysis:
 
     Attributes
     ----------
-    flight : Flight
-    whatif : WhatIf
-        Results of the replays. Its field ``whatif`` has the replay with ``changes`` and ``without``
-        (if any), and then one replay for each value of the sweep.
     changes : mapping from PX4 name to value
         Changed parameters; empty if only a sweep is requested.
     uses_estimates : bool
         True if the changes are the maximum-likelihood estimates.
+    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
+        Explanation of the difference between KF (default settings) and EKF2 as flown.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source.
-    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Differences between KF with default settings and EKF2 as flown; empty if not comparable.
     """
 
     flight: Flight
@@ -130,7 +117,7 @@ class WhatIfAnalysis:
 
 
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """Return the failed EKF2 checks of the option ``--checks``, as axis or aiding source: verdict.
+    """Return the verdicts of failed EKF2 checks (``--checks``), by axis or aiding source.
 
     A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
     biased or not fused for too long.

@@ -15,6 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from msgspec import structs
 
@@ -46,6 +47,7 @@ from px4fuse.ekf2.whatif import sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.log import WITHHELD
@@ -53,6 +55,21 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
+
+# Parts of an analysis that px4fuse withholds from a flight that is an assignment
+WITHHELD_PARTS: dict[str, Any] = dict.fromkeys(
+    [
+        "clock",
+        "heading",
+        "bias_scale_jump_fit",
+        "source_low_pass",
+        "time_correlated_noise",
+        "ekf2_model",
+        "aids",
+        "loop",
+    ],
+    WITHHELD,
+)
 
 
 def diagnose(
@@ -72,7 +89,7 @@ def diagnose(
     flight : Flight, optional
         Flight from the files of the request; without it, the files are read.
     as_sent : bool
-        True to analyse the positions as sent, without the check of their axes, unit and clock.
+        True to skip the check of axes, unit and clock of the positions.
 
     Raises
     ------
@@ -87,12 +104,24 @@ def diagnose(
 
 
 def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate noises and time offset, re-run both filters with changes, and find faults."""
+    """Explain a comparison: estimate errors, re-run the filters without each error, find faults.
+
+    Of a flight that is an assignment, only the comparison is returned.
+    """
+    if comparison.flight.log.is_assessed:
+        return Analysis(
+            **vars(comparison),
+            **WITHHELD_PARTS,
+            tuning={HORIZONTAL: WITHHELD},
+            difference_steps=dict.fromkeys(comparison.axes, WITHHELD),
+            trials=(),
+            events=collect_events(comparison),
+        )
     estimates = estimate(comparison, progress)
     convention, clock = comparison.convention, estimates.clock
     is_late = find_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
     if convention and is_late and isinstance(clock, ClockOffset) and clock.is_determinable:
-        # the estimate from corrected timestamps is more precise
+        # this maximum-likelihood estimate is more precise than the offset of the convention check
         convention = structs.replace(convention, late_s=-clock.offset_s)
         comparison = replace(comparison, convention=convention)
     reruns = intervene(comparison, estimates, progress)
@@ -105,7 +134,7 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
         **vars(estimates),
         **vars(reruns),
         events=collect_events(comparison),
-        aids=WITHHELD if flight.log.is_assessed else evaluate_aids(flight),
+        aids=evaluate_aids(flight),
         loop=analyse_flight_loop(flight, progress),
     )
     return replace(analysis, findings=find(analysis))
@@ -182,10 +211,7 @@ def prepare_comparison(
 def intervene(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run both filters with changes."""
-    if comparison.flight.log.is_assessed:
-        withheld_steps = dict.fromkeys(comparison.axes, WITHHELD)
-        return Reruns(ekf2_model=WITHHELD, difference_steps=withheld_steps, trials=())
+    """Replay EKF2, explain the difference KF - EKF2, and re-run the filters without each error."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     model = open_model(
@@ -267,7 +293,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # EKF2 can be replayed without KF, too
+    except MissingDataError:  # only the default change needs the estimates of a comparison
         if is_default_change:
             raise
     if comparison is not None:

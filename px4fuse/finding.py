@@ -9,8 +9,8 @@ from px4fuse.core.record import Record, Span
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
-MAX_LISTED_SPANS = 3  # maximum number of printed time spans; more spans become one range
-MIN_SPAN_S = 0.05  # minimum duration (s) of a span; a shorter one is printed as a single time
+MAX_LISTED_SPANS = 3  # maximum number of printed time spans; more are printed as one range
+MIN_SPAN_S = 0.05  # minimum duration (s) of a span; a shorter span is printed as one time
 
 
 class Finding(Record, frozen=True, omit_defaults=False):
@@ -19,23 +19,22 @@ class Finding(Record, frozen=True, omit_defaults=False):
     Attributes
     ----------
     id : str
-        Key of the catalogue, in snake case; it does not change between versions.
+        Key in ``catalogue.toml``; it does not change between versions.
     severity : {"error", "warning", "note"}
-        error: the comparison or the flight is misleading; warning: a number is wrong or missing;
-        note: background for reading the report.
+        error: the results are not usable; warning: a result is wrong or missing; note:
+        information on the report.
     message : str
         The fault, then its effect with numbers.
     remedy : str
         Action: a command, a parameter with its value, or a check.
     evidence : dict
-        Numbers that the finding is based on, with units in their names.
+        Numbers by name with unit.
     title : str
-        First sentence of the message, without full stop: the fault with its numbers.
+        First sentence of the message: the fault with its numbers.
     caused_by : str or None
-        Id of the finding that causes this one: the nearest preceding finding with this id.
+        Id of the finding that causes this one.
     spans_s : tuple of (float, float)
-        Start and end of each occurrence, seconds from the first data; empty if the finding
-        concerns the whole flight.
+        Start and end of each occurrence (s from the first data); empty for the whole flight.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]

@@ -194,7 +194,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Values of an EKF2 parameter for replays: equal ratios if ``low`` > 0, else equal steps."""
+    """Values of an EKF2 parameter for replays, spaced logarithmically if ``low`` is above 0."""
 
     parameter: str
     low: float
@@ -301,7 +301,7 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Option of each Python argument that errors name and that OPTION_NAMES does not contain
+# Options of arguments in error messages that are not options of one request only
 _ARGUMENTS = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.core.record import Unavailable
-from px4fuse.loop.model import Closure, Correction, LoopResult, OdometryNoise, TrueEnd
+from px4fuse.loop.model import Closure, CorrectedPath, Loop, OdometryNoise, TrueEnd
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
 from px4fuse.results.model import Student, provenance, schema_of
 from px4fuse.results.reading import read_results
 from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association
-from px4fuse.trajectory.evaluation import AbsoluteError, Score
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import Track
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset
@@ -24,10 +24,10 @@ SHA256 = EXAMPLE["log"]["sha256"]
 NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
-def correction(rmse: float, moved_m: float) -> Correction:
+def correction(rmse: float, moved_m: float) -> CorrectedPath:
     """Return a correction with one score."""
     statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
-    score = Score(
+    score = Evaluation(
         alignment="se3",
         alignment_reason="asked",
         transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
@@ -38,7 +38,7 @@ def correction(rmse: float, moved_m: float) -> Correction:
         notes=(),
         warnings=(),
     )
-    return Correction(
+    return CorrectedPath(
         correction_max_m=moved_m, correction_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
     )
 
@@ -49,7 +49,7 @@ LOOP = to_plain(
         request=LoopRequest(source="loop.ulg:vio"),
         track=Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),
-        loop=LoopResult(
+        loop=Loop(
             track="loop.ulg:vio",
             kind="vio",
             frame="NED",

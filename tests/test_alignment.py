@@ -156,7 +156,7 @@ def test_align_sample_position_file_detects_frame_and_offset(
 ) -> None:
     alignment, track = align(sample_flight, external)
     assert alignment.frame == "enu"
-    assert "smallest residual against EKF2 position" in alignment.frame_reason
+    assert "smallest residual against the EKF2 position" in alignment.frame_reason
     assert alignment.reference == EKF2_POSITION
     assert alignment.yaw_deg == 0.0
     assert alignment.yaw_sigma_deg is None
@@ -216,12 +216,12 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     alignment, track = align(flight, file)
     assert alignment.frame == frame
     assert alignment.frame_reason.startswith(
-        f"smallest residual against EKF2 position ({frame} 0.1"
+        f"this frame has the smallest residual against the EKF2 position ({frame} 0.1"
     )
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = align(flight, replace(file, frames=(frame,) if frame else ()))
     assert alignment.frame == frame
-    assert alignment.frame_reason == "according to the column names of the position file"
+    assert alignment.frame_reason == "the column names of the position file show the frame"
 
 
 def test_align_position_file_on_45_degree_path_needs_frame() -> None:
@@ -262,7 +262,7 @@ def test_align_position_file_adds_its_positions_to_the_flight(flight: Flight) ->
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
     assert (track.origin, track.frame) == (POSITION_FILE, "NED")
-    assert track.clock.endswith(" s, matched with EKF2 position")
+    assert track.clock.endswith(" s (matched with EKF2 position)")
     assert tuple(others) == flight.positions
     assert result.inputs == (InputFile("uwb.csv", "f" * 64, 1234, "position"),)
     assert result.log.notes == ("uwb.csv: time: column 1", "uwb.csv: two rows dropped")

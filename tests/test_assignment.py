@@ -19,11 +19,11 @@ from px4fuse.classroom.assignment import assignment
 from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned
 from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
-    ASSIGNABLE_MISTAKES,
     COUNT_FRACTIONS,
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
     LOOP_FRACTION,
+    RULES_BY_KIND,
     derive_key,
     draw,
 )
@@ -49,7 +49,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind}
+CHOICE = {choice.mistake: choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes}
 
 
 def choices_of(drawn):
@@ -111,7 +111,7 @@ class TestDraw:
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.mistake for one in flights for choice in choices_of(one)}
-        assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
+        assert names == {choice.mistake for choice in RULES_BY_KIND[kind].mistakes}
 
     def test_mixed_assignment_contains_aisle_and_loop_flights(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
@@ -141,14 +141,16 @@ class TestDraw:
                     assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= HARDEST_DIFFICULTY
-        both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.has_either_sign}
+        both = {
+            choice.mistake for choice in RULES_BY_KIND["aisle"].mistakes if choice.has_either_sign
+        }
         assert {name for name, positive in signs if not positive} == both
 
     def test_fault_size_limits_equal_smallest_detected_sizes(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind):
+        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes):
             plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.mistake]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())

@@ -350,7 +350,7 @@ def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, paramet
         ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100; "
          "the default 0 is used."),
         ("EKF2_ACC_NOISE", np.nan, "is not a finite number; the default 0.35 is used."),
-        ("SDLOG_PROFILE", np.inf, "is not a finite number and is not used."),
+        ("SDLOG_PROFILE", np.inf, "is not a finite number; the parameter is not used."),
     ],
 )  # fmt: skip
 def test_px4_parameter_out_of_range_is_replaced_by_default(tmp_path, parameter, value, note):

@@ -247,7 +247,7 @@ def test_batch_second_run_processes_only_new_logs(flights, tmp_path, monkeypatch
     # another run with other settings replaced the cached rows
     monkeypatch.setattr(run, "load_cached_rows", lambda *_: iter(()))
     assert (
-        "replaced the rows of this log"
+        "changed the results of this log"
         in px4fuse.run_batch(logs / "f1.ulg", output).loc[0, "reason"]
     )
     monkeypatch.setattr(run, "load_cached_rows", load_cached_rows)

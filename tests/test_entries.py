@@ -108,6 +108,28 @@ def test_zip_entry_time_orders_reports_but_deducts_no_points() -> None:
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
+@pytest.mark.parametrize(
+    ("extension", "grace_s", "late_s"),
+    [
+        ("", 0.0, 46 * 3600.0),
+        ("2026-11-22 09:00", 0.0, 3541.0),
+        ("2026-11-22 09:00", 3600.0, 0.0),
+        ("2026-11-22", 0.0, 0.0),
+    ],
+)
+def test_class_entry_extension_and_grace_reduce_the_delay(extension, grace_s, late_s) -> None:
+    term = Course(RUBRIC, due=DUE, grace_s=grace_s, late_rule=parse_late_rule("10%/day"))
+    people = (replace(PEOPLE[0], extended_due=extension), *PEOPLE[1:])
+    (ada, _), _ = make_entries(THREE, term, people=people)
+    assert (ada.late_s, ada.deduction > 0.0) == (late_s, late_s > 0.0)
+
+
+def test_class_entry_with_invalid_extension_names_the_student() -> None:
+    people = (replace(PEOPLE[0], extended_due="two days"), *PEOPLE[1:])
+    with pytest.raises(SettingsError, match=r"extension of .*'two days' is not a valid time"):
+        make_entries(THREE, Course(RUBRIC, due=DUE), people=people)
+
+
 def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
     essay = replace(
         graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
@@ -319,7 +341,7 @@ def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
         ("1,,5,", "for an item or total"),
-        ("1,A,5,\n1,A,6,", "student 1 has another row for item A"),
+        ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )
 def test_read_overrides_with_invalid_row_raises_error(tmp_path, row, says) -> None:

@@ -102,7 +102,7 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert form_points(RIGHT, TRUTH).is_named_by_mistake == {"clock-offset": True, "dropout": True}
+    assert form_points(RIGHT, TRUTH).is_kind_named == {"clock-offset": True, "dropout": True}
 
 
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))

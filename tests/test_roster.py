@@ -240,6 +240,18 @@ def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> No
     assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
+def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
+    sheet = table(tmp_path, MOODLE)
+    scaled = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS, 50.0)[0]
+    maximum = ENTRIES[0].max_points
+    assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
+
+
+def test_read_people_reads_extension_of_due_time(tmp_path) -> None:
+    sheet = table(tmp_path, "id,name,Extension\n0042,Jane Doe,2026-11-22 12:00\n7,Max Roe,\n")
+    assert [person.extended_due for person in read_people(sheet)] == ["2026-11-22 12:00", ""]
+
+
 def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)

@@ -242,7 +242,7 @@ def test_default_report_does_not_replace_another_file(made, name) -> None:
     mine = Path("reports") / name
     mine.parent.mkdir()
     mine.write_text("mine")
-    with pytest.raises(OutputError, match=f"{name} exists and is not a report"):
+    with pytest.raises(OutputError, match=f"{name} exists and was not overwritten, because"):
         reported(made)
     assert mine.read_text() == "mine"
 
@@ -264,7 +264,7 @@ def test_explore_page_of_another_log_is_not_overwritten(desk, sample_log) -> Non
     page = Path("reports/l.html")
     run_checked("explore", "l.ulg")
     before = page.read_bytes()
-    assert "l.html exists and is not a web page" in error_line("explore", "b/l.ulg")
+    assert "l.html exists and was not overwritten" in error_line("explore", "b/l.ulg")
     assert page.read_bytes() == before
     run_checked("explore", "l.ulg")
 
@@ -281,7 +281,9 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
     page.parent.mkdir()
     page.write_bytes(mine)
-    assert f"{page} exists and is not a web page of" in error_line(*command.split())
+    assert f"{page} exists and was not overwritten, because it is not a web page of" in error_line(
+        *command.split()
+    )
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine

@@ -10,24 +10,14 @@ from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, desc
 from px4fuse.flight.model import Columns, Flight, PositionTrack, time_index
 from px4fuse.flight.position_source import POSITION_FILE
 
-# Maximum time span (s) of file and log for the check: the search takes 1 s per hour
+# Maximum time span (s) of file and log for explain_mismatch, which takes 1 s per hour
 MAX_SPAN_S = 7200.0
 
 
 def explain_mismatch(
     flight: Flight, problem: AlignmentProblem, metres_per_unit: float = 1.0
 ) -> tuple[str, str] | None:
-    """Find an error of the axes or the unit of a position file, and an action for it.
-
-    Return None if the motion of the flight shows no such error.
-
-    Parameters
-    ----------
-    flight : Flight
-    problem : AlignmentProblem
-    metres_per_unit : float
-        Factor that was applied to the positions of the file.
-    """
+    """Return fault and action if the IMU data show wrong axes or a wrong unit of the file."""
     samples = problem.samples
     span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
     if span_s > MAX_SPAN_S:

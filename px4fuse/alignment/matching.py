@@ -41,19 +41,18 @@ MIN_ROTATION_RMS_M = 0.3
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Positions of a file, and the alignment parameters that the user gave.
+    """Positions of a file, and the alignment parameters that the user gave; None: estimated.
 
     Attributes
     ----------
     samples : DataFrame
-        Positions of the file, on the clock of the file.
+        Positions on the clock of the file.
     frames : tuple of str
-        Possible frames of the file: one is used as it is, the best of several is estimated; empty
-        to try all of ALL_FRAMES.
+        Possible frames of the file; empty for all of ALL_FRAMES.
     yaw_rad : float or None
-        Rotation of the frame of the file relative to the frame of EKF2; None: to be estimated.
+        Yaw of the file's frame relative to the frame of EKF2.
     lag_s : float or None
-        Flight time of the first sample of the file; None: to be estimated.
+        Flight time of the first sample.
     """
 
     samples: pd.DataFrame
@@ -71,13 +70,13 @@ class Match:
     reference : SampledTrack
     frame : str
     residuals_m : dict from frame to float
-        Residual in each frame that was tried, best first.
+        Residual in each tried frame, best first.
     fit : Fit
-        Fit with the yaw of the user, or with estimated yaw if the user gave none.
+        Fit with the yaw of the user, if given.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool
-        True if the frame of the file is misaligned; the time offset is then from ``free_yaw_fit``.
+        True if the yaw of the user is wrong.
     """
 
     reference: SampledTrack
@@ -89,7 +88,7 @@ class Match:
 
     @property
     def time_offset_fit(self) -> Fit:
-        """Fit that determines the time offset of the file."""
+        """Fit with the better time offset: a wrong yaw of the user would bias the offset."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
@@ -103,12 +102,12 @@ class Match:
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     """Match the position file with EKF2's position, or else with the IMU.
 
-    Return None if neither is suitable and no parameter has to be estimated.
+    Return None if there is no match, and the user gave all parameters.
 
     Raises
     ------
     NoMatchError
-        A parameter cannot be estimated; the error contains an action.
+        A parameter cannot be estimated.
     """
     value_by_option = {
         "clock_offset_s": problem.lag_s,
@@ -168,17 +167,14 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Return True if estimating yaw and origin reduces the residual by MIN_ROTATION_RATIO.
-
-    ``horizontal_rms_m`` is the residual (RMS per axis) with the yaw of the user.
-    """
+    """Return True if the residual with estimated yaw is much smaller than ``horizontal_rms_m``."""
     return horizontal_rms_m > MIN_ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
         horizontal_rms_m > MIN_ROTATION_RMS_M or reference == IMU
     )
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Return True if file and reference agree well, and do not at another time offset."""
+    """Return True if the match is good, and no other time offset fits nearly as well."""
     return (
         fit.concordance >= GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
@@ -216,7 +212,6 @@ def _check_match(match: Match) -> None:
 
 
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Repeat the fit to EKF2 without the resets that the comparison with the file removes."""
     ekf2 = flight.ekf2
     fit = match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
@@ -239,10 +234,6 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    """Fit a position file to a reference by least squares.
-
-    Unless the user gave the lag, the fit starts at the lag with the maximum correlation.
-    """
     track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))

@@ -29,13 +29,13 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.log import SHARED_STAMPS, ClockMap, InputFile
-from px4fuse.flight.model import Alignment, Flight, PositionTrack, Unavailable
+from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
 
-# Maximum ratio of the residual at the second best time offset to the residual at the best one, for
-# a warning that the time offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
+# Maximum ratio of the second best to the best residual for a warning about an ambiguous time
+# offset, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Maximum fraction of rows with distinct timestamps for a finding that timestamps are too coarse
 MAX_DISTINCT_FRACTION = 0.5
@@ -57,26 +57,17 @@ def align_position_file(
     Parameters
     ----------
     frame : {"ned", "enu", "nwu", "eus", "edn"}, optional
-        Directions of the axes x, y, z; by default from the column names, or else the frame that
-        fits best.
+        Directions of x, y, z; default: from the column names, or else the best fit.
     yaw_deg : float or "auto", optional
-        Rotation of the positions about down, clockwise seen from above, after the conversion to
-        NED; 0 by default. "auto" estimates yaw and origin.
+        Rotation after the conversion to NED, clockwise from above; default 0. "auto" estimates yaw
+        and origin.
     clock_offset_s : float, optional
-        Boot clock of the autopilot minus clock of the file; by default estimated relative to the
-        reference. If EKF2 fused late positions, EKF2's track lags, and the estimate includes this
-        lag.
-
-    Returns
-    -------
-    Flight
-        The file is the first track in ``positions`` and is listed in ``inputs``. The notes of its
-        reader are in ``log.notes``. Samples outside of the flight are kept.
+        Boot clock of the autopilot minus clock of the file; default: estimated.
 
     Raises
     ------
     SettingsError
-        The frame is unknown, or yaw or time offset is not a finite number.
+        A parameter is invalid.
     MissingDataError
         A parameter cannot be estimated, or file and log do not overlap in time.
     """
@@ -116,9 +107,9 @@ def align_position_file(
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
         yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
-    frame_reason = "according to the column names of the position file"
+    frame_reason = "the column names of the position file show the frame"
     if recording.format:
-        frame_reason = f"according to the format {recording.format}"
+        frame_reason = f"files of the format {recording.format} have this frame"
     if frame:
         frame_reason = "the frame was given with --position-frame"
     alignment, aligned_samples = _describe_alignment(
@@ -135,7 +126,7 @@ def align_position_file(
         samples=aligned_samples,
         frame="NED",
         clock=f"{recording.clock} clock of the position file; boot clock minus this clock: "
-        f"{alignment.clock_offset_s:+.3f} s, {clock_source}",
+        f"{alignment.clock_offset_s:+.3f} s ({clock_source})",
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
@@ -158,10 +149,7 @@ def align_position_file(
 
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
-    """Describe the clock of a file in which most rows repeat a timestamp.
-
-    Return None for any other file.
-    """
+    """Return the clock of a file in which most rows repeat a timestamp, else None."""
     distinct = len(recording.samples)
     count = distinct + recording.dropped
     if distinct > MAX_DISTINCT_FRACTION * count:
@@ -206,20 +194,25 @@ def _describe_alignment(
         frame = match.frame
         reference = match.reference.name
         if len(problem.frames) != 1:
-            frame_reason = f"smallest residual against {reference} ({match.residuals_text})"
+            frame_reason = (
+                f"this frame has the smallest residual against the {reference} "
+                f"({match.residuals_text})"
+            )
             if is_yaw_free and frame == "enu":
-                nwu_note = "nwu differs from enu only in yaw, which was estimated"
-                frame_reason = f"{frame_reason}; {nwu_note}"
+                frame_reason += "; nwu is enu with another yaw, and the yaw was estimated"
         if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
-            yaw_reason = f"estimated against {reference}"
+            yaw_reason = f"the yaw was estimated with the {reference}"
             origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
         if clock_offset_s is None:
             lag_s = match.time_offset_fit.lag_s
             clock_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
-            clock_reason = f"estimated against {reference}, including the delay of {reference}"
+            clock_reason = (
+                f"the offset was estimated with the {reference} and includes the delay of the "
+                f"{reference}"
+            )
         correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
@@ -270,11 +263,7 @@ def _describe_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) of file and EKF2, and the correlation of both tracks.
-
-    The correlation is None if EKF2 hardly moves. Return None if EKF2 has no position at the times
-    of the file.
-    """
+    """Return the horizontal distances (m) and the correlation of file and EKF2, if available."""
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
@@ -285,25 +274,18 @@ def _compare_with_ekf2(
         return None
     if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
-    file_position = (
-        aligned_samples["north_m"].to_numpy() + 1j * aligned_samples["east_m"].to_numpy()
-    )[is_known]
-    ekf2_position = (ekf2[:, 0] + 1j * ekf2[:, 1])[is_known]
-    distance_m = np.abs(file_position - ekf2_position)
-    file_position = file_position - np.mean(file_position)
-    ekf2_position = ekf2_position - np.mean(ekf2_position)
-    has_motion = max(np.ptp(ekf2_position.real), np.ptp(ekf2_position.imag)) >= tracks.MIN_MOTION_M
-    power = float(np.linalg.norm(file_position) * np.linalg.norm(ekf2_position))
-    covariance = float(np.vdot(file_position, ekf2_position).real)
-    return distance_m, covariance / power if has_motion and power > 0.0 else None
+    file_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
+    ekf2_m = ekf2[is_known, :2]
+    distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
+    file_m -= file_m.mean(axis=0)
+    ekf2_m -= ekf2_m.mean(axis=0)
+    power = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    if power == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
+        return distance_m, None
+    return distance_m, float(np.sum(file_m * ekf2_m)) / power
 
 
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
-    """Return a sentence on the rotation of the file's frame against the reference.
-
-    ``distance_m`` is the horizontal distance from EKF2, or None if the file is not compared with
-    EKF2. Return an empty string if the frame is not rotated.
-    """
     if match is None:
         return ""
     name = match.reference.name

@@ -16,8 +16,8 @@ MAX_LAG_SHIFT_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Minimum value of 1 minus the concordance coefficient in the likelihood, so that the longest of
-# several nearly perfect matches has the greatest likelihood
+# Lower limit of 1 - concordance in the likelihood, so that the longer of two nearly perfect matches
+# has the larger likelihood
 MIN_DISCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
@@ -34,11 +34,9 @@ class CorrelationPeak:
     Attributes
     ----------
     lag_s : float
-        Flight time of the first sample of the file.
+        Time to add to the times of the file, which start at 0.
     concordance : float
-        Lin's concordance correlation coefficient of the tracks, each minus its mean:
-        2·Re(e^{-iψ}cov) / (sum of both variances). It is 1 for equal tracks, and smaller if their
-        shapes or extents differ. NaN if the user gave the lag.
+        Lin's concordance correlation coefficient, 1 for equal tracks; NaN if the user gave the lag.
     second_peak_s : float
         Second best lag minus best lag; NaN without a second peak.
     second_peak_ratio : float
@@ -53,23 +51,18 @@ class CorrelationPeak:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(CorrelationPeak):
-    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag), near a correlation peak.
+    """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag), near a peak.
 
     Attributes
     ----------
-    concordance : float
-        Concordance coefficient at the peak; if the user gave the time offset, that of the fit.
-    yaw_rad : float
     lag_sigma_s, yaw_sigma_rad : float or None
         Standard deviations; None if the user gave the parameter.
     origin_m : ndarray, shape (3,)
         Position of the file's origin: north, east, down.
     coherence : complex
-        Normalised complex covariance of reference and file before rotation; its angle is the best
-        yaw.
+        Normalised complex covariance of reference and file before the rotation.
     horizontal_rms_m, rms_m : float
-        RMS of the truncated residuals: per horizontal axis, and of the vector. The vector includes
-        the height if file and reference have a height.
+        RMS residual per horizontal axis, and of the vector (with height, if available).
     """
 
     lag_sigma_s: float | None
@@ -86,13 +79,8 @@ def find_correlation_peak(
 ) -> CorrelationPeak:
     """Find the lag at which a position file matches a reference best.
 
-    The yaw is also estimated if ``yaw_rad`` is None.
-
-    With a free origin the residual sum of squares of file f and reference g over an overlap of N
-    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus the
-    log-likelihood of two independent tracks is -N·ln(1 - concordance). This gain is maximised. It
-    prefers a long overlap with an excellent match to a short overlap in which two straight lines
-    match equally well.
+    The maximised quantity is the log-likelihood ratio to two independent tracks, which is
+    -N·ln(1 - concordance) for N common samples.
 
     Raises
     ------
@@ -142,7 +130,7 @@ def find_correlation_peak(
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
-    # Residual (m) per axis; GRID_RESIDUAL_M makes two perfect matches equally good
+    # Residual (m) per axis, at least the interpolation error of the time grid
     mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
@@ -259,7 +247,7 @@ def _robust_scale(residual: Array) -> float:
 
 
 def _autocorrelation_factor(residual: Complex) -> float:
-    """Return 1 + 2Σρ: the number of correlated residuals that equal one independent residual."""
+    """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
     limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
     rho = autocovariance(clipped)

@@ -27,7 +27,7 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# Minimum length (s) of a gap in a track; a gap is also longer than three median intervals
+# A gap in a track is longer than this time (s), and longer than three median intervals
 MIN_GAP_LIMIT_S = 0.5
 # Minimum horizontal motion (m) of a track for a match
 MIN_MOTION_M = 0.5
@@ -47,10 +47,7 @@ BAND_PADDING_S = 10.0
 
 
 class NoMatchError(Exception):
-    """The position file does not match a reference.
-
-    The error contains an action if no other reference can match either.
-    """
+    """The position file does not match a reference; ``remedy`` is the action, if any."""
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -91,10 +88,7 @@ class SampledTrack:
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Convert the positions of a file to north, east, down.
-
-    The times count from the first sample.
-    """
+    """Convert the positions of a file to north, east, down, with times from the first sample."""
     order, sign = FRAMES[frame]
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
     return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position)
@@ -105,10 +99,7 @@ def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample a track to a regular time grid.
-
-    Samples inside gaps are marked as invalid.
-    """
+    """Resample a track to a regular time grid, and mark samples inside gaps as invalid."""
     grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
     is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
     return SampledTrack(grid, track.at(grid)[0], is_known)
@@ -210,7 +201,7 @@ def align_samples(
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track without the resets that the comparison with the file removes."""
+    """Return EKF2's track without the resets that move its origin."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

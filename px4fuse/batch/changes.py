@@ -62,7 +62,7 @@ def diff(
 
 
 def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
-    """List the settings, numbers and findings that differ between two results of comparisons."""
+    """List the settings, numbers and findings that differ between the results of A and B."""
     findings = tuple(_finding_changes(a.results, b.results))
     return contract.ChangeResults(
         schema=schema_of(contract.CHANGES_SCHEMA),
@@ -130,17 +130,17 @@ def compare_numbers(
             path=path,
             label=number.label,
             unit=number.unit,
-            a=None if a is None else a.value,
-            b=None if b is None else b.value,
-            a_interval=None if a is None else a.interval,
-            b_interval=None if b is None else b.interval,
+            a=getattr(a, "value", None),
+            b=getattr(b, "value", None),
+            a_interval=getattr(a, "interval", None),
+            b_interval=getattr(b, "interval", None),
         )
 
 
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Yield the findings whose id and severity occur in the results of only A or only B."""
-    sides: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
-    for results, other_results, only_in in sides:
+    """Yield the findings that only A or only B contains, compared by id and severity."""
+    pairs: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
+    for results, other_results, only_in in pairs:
         ids = {(finding.id, finding.severity) for finding in other_results.findings}
         for finding in results.findings:
             if (finding.id, finding.severity) not in ids:
@@ -157,12 +157,12 @@ def _worse_verdicts(
         if was_consistent and not is_consistent:
             ratio = value_b**0.5
             factor = format_factor(max(ratio, 1.0 / ratio))
-            verdict, size = (
-                ("overconfident", "small") if ratio > 1.0 else ("underconfident", "large")
-            )
+            verdict = "overconfident, σ {} times too small"
+            if ratio < 1.0:
+                verdict = "underconfident, σ {} times too large"
             yield (
                 f"{name}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
-                f"({verdict}, σ {factor} times too {size})."
+                f"({verdict.format(factor)})."
             )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
@@ -172,7 +172,7 @@ def _worse_verdicts(
 
 
 def _verdicts_by_axis(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return mean NIS or NEES, and True if consistent, by label such as "Mean NIS of KF, north"."""
+    """Return each mean NIS and mean NEES, and True if it is consistent, by its label."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
         for name, label in FILTER_LABELS.items():

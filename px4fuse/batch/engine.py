@@ -29,12 +29,9 @@ JOBS_PER_TASK = 4
 
 @contextmanager
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
-    """Connect to a Dask cluster; provide its client, or None to run the jobs on this computer.
+    """Connect to the Dask cluster with the scheduler at this address.
 
-    Parameters
-    ----------
-    scheduler : str, optional
-        Address of a running Dask scheduler; default: this computer.
+    Without an address, provide None instead of a client: the jobs then run on this computer.
 
     Raises
     ------
@@ -87,20 +84,14 @@ def _check_workers(client: Client) -> None:
 
 def run_jobs(
     client: Client | None,
-    work: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
+    run_list: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
     jobs: Sequence[Job],
     processes: int | None = None,
 ) -> Generator[tuple[Job, Result | JobFailure]]:
-    """Yield each job with its result, in the order in which jobs finish.
+    """Run jobs on a Dask cluster, or on this computer if ``client`` is None.
 
-    Parameters
-    ----------
-    client : Client or None
-        Client of a cluster; None for processes of this computer.
-    work : callable
-        Function that runs a list of jobs: :func:`~px4fuse.core.workers.run_bounded` with limits.
-    processes : int, optional
-        Number of parallel processes on this computer; default: number of cores.
+    ``run_list`` runs a list of jobs in ``processes`` processes (default: the number of cores). Each
+    job is returned with its result as soon as it is finished.
 
     Raises
     ------
@@ -108,33 +99,33 @@ def run_jobs(
         The connection to the scheduler was lost.
     """
     if client is None:
-        for index, result in work(jobs, processes=processes):
+        for index, result in run_list(jobs, processes=processes):
             yield jobs[index], result
         return
     from distributed import as_completed  # noqa: PLC0415
 
-    chunks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
+    tasks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
     futures = dict(
-        zip(client.map(partial(_run_chunk, work), chunks, pure=False), chunks, strict=True)
+        zip(client.map(partial(_run_task, run_list), tasks, pure=False), tasks, strict=True)
     )
     try:
         for future in as_completed(list(futures)):
-            chunk = futures.pop(future)
+            task_jobs = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
             # the worker process ended several times, or cannot load the job
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
-            results = [failure] * len(chunk) if error else future.result()
-            yield from zip(chunk, results, strict=True)
+            results = [failure] * len(task_jobs) if error else future.result()
+            yield from zip(task_jobs, results, strict=True)
     finally:
         if futures and client.status == "running":
             client.cancel(list(futures))
 
 
-def _run_chunk(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
+def _run_task(run_list: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
     # a Dask worker is a daemon process by default, which Python does not allow to start processes
     multiprocessing.current_process().daemon = False
-    results_by_index = dict(work(jobs, processes=1))
+    results_by_index = dict(run_list(jobs, processes=1))
     return [results_by_index[index] for index in range(len(jobs))]

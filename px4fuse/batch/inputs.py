@@ -19,9 +19,9 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Fields of the settings that px4fuse diff takes from the results of one input to analyse the log of
-# the other input. Settings in _SEGMENT_FIELDS are used only if both inputs are of the same log
+# Settings that are copied from the results of one input to analyse the log of the other input
 _FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
+# Settings that are copied only if both inputs belong to the same log
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
@@ -56,7 +56,7 @@ def read_inputs(
 
 
 def _read_attached(path: Path) -> DiffInput | None:
-    """Return the results in a report (PDF) or a JSON file; None for a log."""
+    """Read the results in a report (PDF) or a JSON file; return None for a log."""
     name, head = display_name(path), read_head(path, 64, LogError)
     is_report = head.startswith(b"%PDF-")
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):

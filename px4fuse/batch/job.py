@@ -15,20 +15,9 @@ from px4fuse.request import ComparisonRequest, with_options
 
 @dataclass(frozen=True)
 class Job:
-    """Log that ``px4fuse batch`` analyses, with settings and limits.
+    """Log to analyse, by its absolute path or URL, and the settings of the analysis.
 
-    Attributes
-    ----------
-    address : str
-        Absolute path or URL of the log.
-    request : ComparisonRequest
-        Settings of the analysis; ``address`` replaces the log in the request.
-    with_report : bool
-        True to make the PDF report.
-    max_bytes : int
-        Maximum size of the log (bytes).
-    finished_hashes : frozenset of str
-        SHA-256 of all logs with the size of this log whose results already exist.
+    The log is not analysed if its SHA-256 is in ``finished_hashes``.
     """
 
     address: str
@@ -40,17 +29,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Table rows, results and report of one log in ``px4fuse batch``.
+    """Table rows, results (JSON) and report (PDF) of one log; empty if they were not made.
 
-    Attributes
-    ----------
-    sha256 : str
-        SHA-256 of the log; empty if the log could not be read.
-    rows : tuple of Row
-        One row per axis. A single row if the log could not be compared. No row if the results of
-        the log already exist.
-    results, report : bytes
-        Results (JSON) and report (PDF); empty if not made.
+    ``rows`` has one row per axis, or a single row with the reason if the log could not be compared.
     """
 
     sha256: str
@@ -60,7 +41,7 @@ class Outcome:
 
 
 def analyse(job: Job) -> Outcome:
-    """Compare one log as ``px4fuse compare`` does; after an error, one row contains the reason."""
+    """Compare one log as ``px4fuse compare`` does."""
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:

@@ -24,18 +24,9 @@ LOG_SUFFIXES = (".ulg", ".tlog", ".bin")
 
 @dataclass(frozen=True, order=True)
 class LogAddress:
-    """Name, address and size of a log, before the log is read.
+    """Log that was found but not read: file name, path or URL for the table, and size if known.
 
-    Attributes
-    ----------
-    name : str
-        File name without folder.
-    log : str
-        Path or URL in the table; relative to the working directory if the user's argument is.
-    address : str
-        Absolute path or URL, with which a worker process opens the log.
-    size_bytes : int or None
-        Size of the log; None if the file system does not provide it.
+    ``address`` is the absolute path or URL, with which a worker process opens the log.
     """
 
     name: str
@@ -45,12 +36,7 @@ class LogAddress:
 
 
 def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
-    """Find the different logs among files, folders, globs and URLs, sorted by name.
-
-    Parameters
-    ----------
-    patterns : iterable of str
-        Files, folders (in which files with LOG_SUFFIXES are logs), globs and URLs.
+    """Find the logs among files, folders, globs and URLs, each log once and sorted by name.
 
     Raises
     ------
@@ -75,7 +61,8 @@ def _logs_in(pattern: str) -> list[LogAddress]:
                 for path, info in all_files.items()
                 if PurePosixPath(path).suffix.lower() in LOG_SUFFIXES
             }
-        elif file_system.exists(root):  # a worker process rejects devices and pipes
+        # devices and pipes are included: the worker process that opens them reports an error
+        elif file_system.exists(root):
             info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
         else:
             all_files = (

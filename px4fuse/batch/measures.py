@@ -1,7 +1,8 @@
-"""Numbers that ``px4fuse diff`` compares, as listed in ``measures.csv``, with 95 % intervals.
+"""Numbers that ``px4fuse diff`` compares, with 95 % intervals.
 
-A path consists of the keys that lead to a value in the results, joined by dots. In a pattern, ``*``
-replaces the name of an axis, a tuning result or an aiding source.
+``measures.csv`` lists their paths in the results, such as ``axes.*.rejected_fraction``. In a path,
+``*`` stands for any axis, noise estimate or aiding source, and FILTER for KF and EKF2. The unit
+"share" is a fraction from 0 to 1.
 """
 
 from collections.abc import Iterator
@@ -10,16 +11,15 @@ from dataclasses import dataclass
 from px4fuse.batch.rows import read_rows, value_at
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import Clock
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
 FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
-# Columns of measures.csv: pattern of the path, label, unit ("share": fraction from 0 to 1), and
-# field with the 95 % interval (empty if the results contain none). FILTER represents KF and EKF2
+# Numbers to compare, as dicts of path, label, unit, and name of the field with the 95 % interval
 MEASURES = [
     row
-    | {key: row[key].replace("FILTER", text) for key, text in (("path", name), ("label", label))}
+    | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
     for row in read_rows("measures.csv")
     for name, label in (FILTER_LABELS.items() if "FILTER" in row["path"] else [("", "")])
 ]
@@ -40,11 +40,11 @@ class ComparedNumber:
 
 
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
-    """Return the numbers of MEASURES by path, except estimates that are not determinable."""
+    """Return the numbers to compare, by their path in the results."""
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the numbers of the aiding source that is the position source are in the axes already
+    # omitted, because the numbers of each axis contain those of the position source
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         source_aids = ("gnss_pos",)
@@ -52,10 +52,10 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     for measure in MEASURES:
         pattern, interval_field = measure["path"], measure["interval"]
         for path, names in _matching_paths(results, pattern):
-            parent, _, field = path.rpartition(".")
-            record, first_name = value_at(results, parent), names[0] if names else ""
+            record_path, _, field = path.rpartition(".")
+            record, first_name = value_at(results, record_path), names[0] if names else ""
             value = getattr(record, field, None)
-            is_undetermined = isinstance(record, Clock) and not record.is_determinable
+            is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = pattern.startswith("aids.") and first_name in source_aids
             if pattern == "axes.*.rejected_fraction":
@@ -75,10 +75,10 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
 def _matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each path in the results that matches a pattern, with the names in place of ``*``."""
-    head, has_wildcard, tail = pattern.partition(".*")
+    """Yield matching paths, such as ``axes.north.rejected_fraction`` with the names ("north",)."""
+    parent, has_wildcard, rest = pattern.partition(".*")
     if not has_wildcard:
         yield pattern, ()
-    for name in (value_at(results, head) or ()) if has_wildcard else ():
-        for path, names in _matching_paths(results, f"{head}.{name}{tail}"):
+    for name in (value_at(results, parent) or ()) if has_wildcard else ():
+        for path, names in _matching_paths(results, f"{parent}.{name}{rest}"):
             yield path, (name, *names)

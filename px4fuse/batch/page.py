@@ -9,8 +9,9 @@ from typing import Any
 import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
-from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
+from px4fuse.card.model import AXIS_ENDS
 from px4fuse.core.text import format_metres, format_number, format_ratio, join_first
+from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
@@ -23,8 +24,9 @@ from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns that the page shows after a click on a row: one value per axis (AXIS_COLUMNS) or per log
+# Columns with one value per axis, which the page shows after a click on a row
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
+# Columns with one value per log, which the page shows after a click on a row
 LOG_COLUMNS = [
     name
     for name, path in RESULT_PATHS.items()
@@ -47,7 +49,7 @@ LOG_COLUMNS = [
 ]
 # Name of the group of columns that the page shows on request
 EXTRA_COLUMN_GROUP = "numbers"
-# Label of each page filter, by the first word of its tags
+# Label of each page filter, by the first word of its tags, such as "severity:error"
 PAGE_FILTERS = {
     "severity": "Diagnosis",
     "status": "Status",
@@ -59,10 +61,7 @@ PAGE_FILTERS = {
 # Axes whose numbers represent the log in the table: the aisle, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: One log on the page: the non-empty columns of its rows, preferably of MAIN_AXES, and
-#: ``severity`` (also of logs without a result), ``verdict_texts`` (four verdicts), ``status``
-#: ("done" if one axis is done), ``missing_results`` (reasons for missing results, with actions),
-#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (labels by value of page filters)
+#: One log on the page: table columns by name, and the columns that :func:`_log_summary` adds
 Log = Mapping[str, Any]
 
 
@@ -115,7 +114,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={"bands": SIGMA_RATIO_BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
+        ratio_axis={"bands": CONSISTENT_RATIOS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )
 
 
@@ -128,8 +127,8 @@ def _log_cells(log: Log) -> tuple[Cell, ...]:
         Cell(log["name"], log["name"], log.get("changed", "")),
         Cell(log["headline"], log["headline"], action, style_class=style),
         *(
-            _ratio_cell(log.get(f"{name}_ratio"), name, word)
-            for name, word in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
+            _ratio_cell(log.get(f"{name}_ratio"), name, verdict)
+            for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
         _value_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
@@ -145,18 +144,18 @@ def _log_cells(log: Log) -> tuple[Cell, ...]:
     )
 
 
-def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
-    filter_name, _, reference_name = name.partition("_")
-    emphasis = " loud" if word in ("overconfident", "underconfident") else ""
+def _ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
+    filter_name, _, reference_name = name.partition("_")
+    emphasis = " loud" if verdict in ("overconfident", "underconfident") else ""
     return Cell(format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis}")
 
 
 def sort_logs(logs: Iterable[Log]) -> list[Log]:
     """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
 
-    def rank(log: Log) -> tuple[float, ...]:
+    def sort_key(log: Log) -> tuple[float, ...]:
         ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
         largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
         return (
@@ -165,7 +164,7 @@ def sort_logs(logs: Iterable[Log]) -> list[Log]:
             -log.get("position_rmse_m", 0.0),
         )
 
-    return sorted(logs, key=rank)
+    return sorted(logs, key=sort_key)
 
 
 def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Cell:
@@ -211,7 +210,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return each page filter with its options and their log counts, most frequent first."""
+    """Return the label and the options of each page filter, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
@@ -233,19 +232,16 @@ def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
     """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
-    rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    present = (table.notna() & (table != "")).to_numpy()
-    for row, is_present in zip(table.to_dict("records"), present, strict=True):
-        row_values = {
-            str(column): value
-            for (column, value), is_value_present in zip(row.items(), is_present, strict=True)
-            if is_value_present
-        }
-        rows[str(row["log"])].append(row_values)
-    return [_log_summary(axes) for axes in rows.values()]
+    rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in table.to_dict("records"):
+        rows_by_log[row["log"]].append(
+            {str(name): value for name, value in row.items() if pd.notna(value) and value != ""}
+        )
+    return [_log_summary(rows) for rows in rows_by_log.values()]
 
 
 def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
+    """Combine the non-empty columns of a log; those of the main axes replace those of others."""
     axes = [row for row in rows if "axis" in row]
     main_rows = next(
         (m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows

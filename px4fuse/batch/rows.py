@@ -20,12 +20,12 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Name of the noise estimate by axis: north and east share the estimate "horizontal"
+# Name of the noise estimate of an axis: north and east have one estimate, "horizontal"
 _TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
-    """Read a CSV file of this folder as dicts by column title."""
+    """Read a CSV file of the package px4fuse.batch as dicts by column title."""
     with files("px4fuse.batch").joinpath(name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
@@ -40,22 +40,18 @@ Row = dict[str, Any]
 
 
 def value_at(results: object, path: str) -> Any:
-    """Return the value at a path in the results (keys joined by dots); None if it is missing."""
+    """Return the value at a path such as "axes.north.updates", or None if it is missing."""
 
-    def child(parent: Any, name: str) -> Any:
+    def get_child(parent: Any, name: str) -> Any:
         if isinstance(parent, tuple):
             return parent[int(name)]
         return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
 
-    return reduce(child, path.split("."), results)
+    return reduce(get_child, path.split("."), results)
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:
-    """Return the table rows of one log, one per axis; columns without a value are absent.
-
-    SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a common estimate. A
-    time offset that is not determinable from the flight is absent.
-    """
+    """Return the table rows of one log, one per axis; columns without a value are absent."""
     common_columns = log_columns(results.log) | finding_columns(results.findings, results.aids)
     common_columns |= card_columns(results.card)
     has_time_offset = bool(value_at(results, "clock.is_determinable"))
@@ -79,7 +75,10 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Return findings that no other finding causes, and verdicts on EKF2's aiding sources."""
+    """Return the table columns with findings and with verdicts on EKF2's aiding sources.
+
+    Findings that are effects of another finding are omitted.
+    """
     causes = [finding for finding in findings if finding.caused_by is None]
     aid_verdicts = [
         f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"

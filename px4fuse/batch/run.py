@@ -37,7 +37,7 @@ from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.request import ComparisonRequest, command_line
 
-# Table columns with the paths of a log's outputs, relative to the output folder
+# Table columns with the paths of the outputs of a log, relative to the output folder
 FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
@@ -46,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Table and written files of a run of ``px4fuse batch``.
+    """Table of a run of ``px4fuse batch``, with the severities of all findings.
 
     Attributes
     ----------
@@ -54,8 +54,6 @@ class BatchResult:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     reused_count : int
         Number of logs whose results are from an earlier run.
-    severities : frozenset of str
-        Severities of all findings.
     written : tuple of Path
         Files of the table.
     """
@@ -228,7 +226,7 @@ def run(
 
 
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of the logs with finished outputs in the folder, by size of the log."""
+    """Return the SHA-256 of finished logs by size, as only logs of equal size may be identical."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
         first_row = cached_rows.rows[0]
@@ -297,7 +295,7 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
         status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}"
         if first_log is log:
             status = FAILED
-            reason = "another run of px4fuse batch replaced the rows of this log"
+            reason = "another run of px4fuse batch changed the results of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:

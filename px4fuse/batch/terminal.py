@@ -27,29 +27,27 @@ def format_summary(batch_result: BatchResult) -> Page:
     """Format a run of ``px4fuse batch``: reasons for missing results, and diagnoses of all logs."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
-    causes = uncompared.agg(["count", "first"]).reset_index()
-    sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
-    for cause in sorted_causes.head(MAX_LISTED_REASONS).to_dict("records"):
+    reasons = uncompared.agg(["count", "first"]).reset_index()
+    sorted_reasons = reasons.sort_values("count", ascending=False, kind="stable")
+    for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
-        if cause["count"] > 1:
-            template = "{count} logs, for example {first}: {status}: {reason}. {remedy}"
-        page.write(
-            template.format_map(cause).rstrip(), colour=RED if cause["status"] == FAILED else YELLOW
-        )
-    if len(sorted_causes) > MAX_LISTED_REASONS:
-        remaining_count = len(sorted_causes) - MAX_LISTED_REASONS
-        page.write(f"fleet.html lists {remaining_count} more reasons for logs without a result.")
-    entries = sort_logs(logs_of(batch_result.table))
-    if entries:
-        rows = [_diagnosis(log) for log in entries[:MAX_LISTED_LOGS]]
+        if reason["count"] > 1:
+            template = f"{{count}} logs, for example {template}"
+        colour = RED if reason["status"] == FAILED else YELLOW
+        page.write(template.format_map(reason).rstrip(), colour=colour)
+    if (unlisted_count := len(reasons) - MAX_LISTED_REASONS) > 0:
+        page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
+    sorted_logs = sort_logs(logs_of(batch_result.table))
+    if sorted_logs:
+        rows = [_diagnosis(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.table(
             ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
             rows,
             right_aligned_columns=(3, 4, 5, 6),
         )
         page.write(RATIO_NOTE, colour=MUTED_COLOUR)
-    if len(entries) > MAX_LISTED_LOGS:
-        page.write(f"fleet.html lists {len(entries) - MAX_LISTED_LOGS} more logs.")
+    if len(sorted_logs) > MAX_LISTED_LOGS:
+        page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
@@ -116,9 +114,7 @@ def format_differences(results: ChangeResults) -> Page:
 
 
 def _format_setting(value: float | str | None) -> str:
-    if value is None:
-        return "–"
-    return value if isinstance(value, str) else f"{value:.6g}"
+    return f"{value:.6g}" if isinstance(value, int | float) else value or "–"
 
 
 def _format_value(value: float | None, factor: float) -> str:
@@ -129,8 +125,5 @@ def _format_interval(interval: Interval | None) -> str:
     if interval is None:
         return ""
     low, high = interval
-    return (
-        f"above {format_number(low)}"
-        if high is None
-        else f"{format_number(low)} to {format_number(high)}"
-    )
+    low_text = format_number(low)
+    return f"above {low_text}" if high is None else f"{low_text} to {format_number(high)}"

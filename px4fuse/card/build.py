@@ -1,4 +1,4 @@
-"""Diagnosis card of an analysis."""
+"""Build the diagnosis card: short summary of the faults and filter verdicts of one flight."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions that EKF2 rejected, for the card to state it
+# Minimum fraction of rejected positions that the card reports
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
@@ -77,7 +77,7 @@ UNEXPLAINED_DIFFERENCE = (
 )
 WITHHELD_HEADLINE = "Assignment: the diagnosis is the student's, and px4fuse withholds its own"
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
-# Reasons why verdicts against source and ground truth differ, by ids of findings about the source
+# Explanation of different verdicts against source and ground truth, by ids of findings
 SENTENCES_BY_SOURCE_FAULT = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
@@ -101,13 +101,7 @@ def build_card(
 ) -> Card:
     """Build the diagnosis card of a comparison.
 
-    Parameters
-    ----------
-    analysis : Analysis
-    request : ComparisonRequest
-        Options of the user, which the commands on the card repeat without paths.
-    student : (str, str)
-        Name and id of the student.
+    The recommended commands contain the options of ``request``. ``student``: name and id.
     """
     source, segment = analysis.source, analysis.segment
     identity = _identity(
@@ -138,11 +132,15 @@ def build_card(
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
-        reconcile = _horizon_sentence(horizon_ratio)
+        reconcile = (
+            "EKF2's published position lags because of its output predictor, and σ does not "
+            "include this lag. At the fusion horizon, EKF2's position error is "
+            f"{format_ratio(horizon_ratio)} times σ: consistent."
+        )
     elif reconcile == UNEXPLAINED_DIFFERENCE:
         verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
     effect = _make_effect(analysis)
-    severity: CardSeverity = "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
+    severity: CardSeverity = "note" if any(verdict.is_fault for verdict in verdicts) else "clean"
     return Card(
         severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
@@ -163,7 +161,7 @@ def build_card(
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Build the diagnosis card of a flight without a position source, as :func:`build_card`."""
+    """Build the diagnosis card of a flight without a position source, on EKF2's aiding sources."""
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
@@ -192,7 +190,7 @@ def build_aids_card(
 
 
 def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
-    """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
+    """Build the diagnosis card of a log that cannot be analysed: fault and fix."""
     facts = {}
     with suppress(LogError):  # the headline states the reason if the file cannot be read
         head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
@@ -217,22 +215,22 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
             if further_cause.severity == "error" and len(joined_titles) <= MAX_HEADLINE_LENGTH:
                 return joined_titles
         return main_cause.title
-    if faulty := [verdict for verdict in verdicts if verdict.is_loud]:
+    if faulty := [verdict for verdict in verdicts if verdict.is_fault]:
         worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
-        size = worst.ratio or 1.0
-        direction = "small" if size > 1.0 else "large"
-        factor = format_ratio(max(size, 1.0 / size))
+        ratio = worst.ratio or 1.0
+        direction = "small" if ratio > 1.0 else "large"
+        factor = format_ratio(max(ratio, 1.0 / ratio))
         return (
             f"{FILTER_NAMES[worst.filter]} {worst.word}: σ {factor} times too {direction} against "
             f"{'the source' if worst.against == 'source' else 'ground truth'}"
         )
     if all(each.word == "not evaluated" for each in verdicts):
         return "No fault found; KF and EKF2 could not be evaluated"
-    tested = {each.filter for each in verdicts if each.word == "consistent"}
+    consistent_filters = {each.filter for each in verdicts if each.word == "consistent"}
     return (
         NO_FAULT_HEADLINE
-        if len(tested) == 2
-        else f"No fault found: {FILTER_NAMES[tested.pop()]} is consistent"
+        if len(consistent_filters) == 2
+        else f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
     )
 
 
@@ -324,10 +322,6 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    """Describe EKF2's error along the axis with the largest ratio to σ, besides the main axis.
-
-    Empty if EKF2 is not overconfident along this axis.
-    """
     errors = {
         result.axis.label: truth
         for result in analysis.secondary_axes
@@ -361,20 +355,19 @@ def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most MAX_ACTIONS recommended actions, each as one sentence."""
     texts: list[str] = []
     for number, cause in enumerate(causes, 1):
-        sentences = [_action_sentence(action) for action in cause.actions if _is_change(action)]
+        sentences = [
+            _action_sentence(action)
+            for action in cause.actions
+            if action.commands or not action.sentence.startswith("no ")
+        ]
         if cause.alternatives:
             either = [_action_sentence(action) for group in cause.alternatives for action in group]
             sentences.insert(0, ", or ".join([*(text[:-1] for text in either[:-1]), either[-1]]))
         label = f"({number}) " if len(causes) > 1 else ""
         texts += [f"{label}{sentence}" for sentence in sentences]
     return tuple(dict.fromkeys(texts))[:MAX_ACTIONS] if causes else ("Change nothing.",)
-
-
-def _is_change(action: Action) -> bool:
-    return bool(action.commands) or not action.sentence.startswith("no ")
 
 
 def _action_sentence(action: Action) -> str:
@@ -393,10 +386,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark inconsistent verdicts that do not require a change of the filter.
-
-    If the source may drift, a σ that is too large against the source is not a fault.
-    """
+    """Mark inconsistent verdicts on filters that need no change."""
     unchanged = {
         name
         for cause in causes
@@ -411,10 +401,11 @@ def _mark_explained(
     }
     return tuple(
         replace(verdict, is_explained=True)
-        if verdict.is_loud
+        if verdict.is_fault
         and (
             FILTER_NAMES[verdict.filter] in unchanged
             or verdict.filter in truth_is_right
+            # drift does not change innovations, so a small NIS is not a fault
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -423,9 +414,9 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return EKF2's error ÷ σ at the fusion horizon, or None if EKF2 is not consistent only there.
+    """Return EKF2's RMS error ÷ σ at the fusion horizon if EKF2 is consistent there, else None.
 
-    The published position includes the lag of EKF2's output predictor, which σ does not describe.
+    The published position contains the lag of EKF2's output predictor, which σ does not include.
     """
     result, ekf2 = analysis.main, analysis.flight.ekf2
     published_verdict = make_verdicts(result)[-1]
@@ -441,16 +432,7 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     return ratio if classify_ratio(ratio, "truth") == "consistent" else None
 
 
-def _horizon_sentence(ratio: float) -> str:
-    return (
-        "EKF2's published position lags because of its output predictor, and σ does not include "
-        f"this lag. At the fusion horizon, EKF2's position error is {format_ratio(ratio)} times "
-        "σ: consistent."
-    )
-
-
 def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> str:
-    """Explain why verdicts against source and ground truth differ; an empty text if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
@@ -460,9 +442,12 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
     differing = [
         filter_name
         for filter_name in FILTER_NAMES
-        if _verdicts_differ(
-            *(verdict for verdict in verdicts if verdict.filter == filter_name),
-            is_corrected=filter_name in corrected,
+        for source, truth in [[verdict for verdict in verdicts if verdict.filter == filter_name]]
+        if source.ratio is not None
+        and truth.ratio is not None
+        and (
+            source.word != truth.word
+            or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected)
         )
     ]
     if not differing:
@@ -501,15 +486,7 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
     return _gate_sentence(analysis) if is_gated else unexplained_text
 
 
-def _verdicts_differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
-    if source.ratio is None or truth.ratio is None:
-        return False
-    is_far_larger = truth.ratio > 2.0 * source.ratio and not is_corrected
-    return source.word != truth.word or is_far_larger
-
-
 def _gate_sentence(analysis: Analysis) -> str:
-    """Explain that rejected positions increase EKF2's mean NIS but do not change its state."""
     innovations = analysis.main.ekf2_innovations
     assert not isinstance(innovations, Unavailable)  # without innovations EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]

@@ -1,9 +1,4 @@
-"""Causes on the diagnosis card: order, actions, and the re-runs of KF and EKF2 that test them.
-
-A finding is a numbered cause if a re-run with its correction changes a σ ratio or the position
-RMSE, or if no re-run can show its effect. A change of a filter is proposed only if its
-re-run improves position or σ.
-"""
+"""Causes on the diagnosis card: order, actions, and the re-runs of KF and EKF2 that test them."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +33,7 @@ from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
-# Kinds of changes whose re-runs test a finding (:attr:`Trial.kinds`), by id of the finding
+# Kinds of re-runs (:attr:`Trial.kinds`) that test a finding, by id of the finding
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "source_time_offset": frozenset({"time offset", "delay"}),
     "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
@@ -77,11 +72,12 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of changes whose effect only ground truth shows: KF and EKF2 move with the position source
+# Changes that shift KF and EKF2 together with the position source: only ground truth shows their
+# effect
 UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 # Endings of the names of parameters that PX4 reads only at boot (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of positions that EKF2 rejected, for the table of re-runs to show it
+# Minimum rejected fraction that the table of re-runs shows
 MIN_SHOWN_REJECTION = 0.005
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
@@ -92,15 +88,15 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Device or filter to be changed, by id of the finding, if it differs from TARGETS of its group
+# Exceptions to TARGETS, by id of the finding
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
 
 
 class RankedCause(NamedTuple):
-    """Finding with the re-runs that test it, and its rank on the card.
+    """Finding with its re-runs, and with the keys that sort the causes on the card.
 
-    The card lists causes in ascending ``tier``. ``reduction`` is the decrease of |ln σ ratio| in
-    the re-runs.
+    Causes with a small ``tier`` are first, and in each tier those with a large ``reduction`` of
+    |ln σ ratio| by the re-runs.
     """
 
     finding: Finding
@@ -110,22 +106,12 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Rank the findings that no other finding causes, in the order of the card.
-
-    1. Findings that make the verdicts meaningless.
-    2. Findings whose re-run makes a filter consistent.
-    3. Findings whose re-run halves the logarithm of a σ ratio.
-    4. Other findings of severity error, and settings that hardly change the error ÷ σ.
-    5. Other warnings.
-
-    Within a tier, faults of the position source precede settings that would only hide them.
-    """
+    """Sort the errors and warnings that are not effects of other findings by importance."""
     ranked_causes = []
     for finding in root_findings:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.main_trials, finding)
-        # the card lists an inconsistent filter even if no re-run improves the verdict
         if finding.id in VERDICT_FINDINGS:
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
@@ -140,6 +126,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         faults or ranked_causes,
         key=lambda cause: (
             cause.tier,
+            # a changed setting may only hide a fault of the position source
             cause.tier in (1, 2, 3) and _is_setting(cause.finding),
             -cause.reduction,
         ),
@@ -164,11 +151,7 @@ def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that test a finding: the best one for each filter and kind of change.
-
-    The best re-run has the smallest change that makes a filter consistent, else the σ ratios
-    nearest to 1. A noise finding also has the re-run of KF with default settings.
-    """
+    """Return the best re-run of each filter and kind of change that tests a finding."""
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
@@ -180,13 +163,12 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth would show the effect of a re-run, and the log has none."""
+    """Return True if innovations or ground truth show the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def is_useful(trial: Trial) -> bool:
-    """Return True if a re-run improves position or σ, or if :func:`can_show_effect` is False."""
     return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
@@ -196,7 +178,7 @@ def make_cause(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Make the card's entry of a finding, with actions for position source, KF and EKF2."""
+    """Describe a fault on the card, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
@@ -210,7 +192,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make the entry of a finding on the card, without re-runs."""
+    """Describe a fault on the card, with the action of the finding and without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -228,7 +210,7 @@ def _make_actions(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return the alternative groups of actions, one of which is enough, and the other actions."""
+    """Return (groups of alternative actions, actions that are always necessary)."""
     finding = ranked_cause.finding
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
@@ -245,7 +227,7 @@ def _make_actions(
         add_or_subtract = lower_first(format_shift(shift))
         sender = Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
         if analysis.source.origin.is_gnss and general_action is not None:
-            sender = general_action  # a GNSS receiver does not let the user shift its timestamps
+            sender = general_action  # users cannot shift the timestamps of a GNSS receiver
         if delay is not None:
             alternatives = ((sender,), (set_parameters(analysis, delay.change),))
         else:
@@ -264,7 +246,6 @@ def _make_actions(
             defaults = by_kind["kf", "defaults"].change if is_default else {}
             actions.append(run_again(request, trial.change, defaults))
         elif filter_name == "ekf2" and kind != "delay":
-            # with corrected timestamps EKF2 may need a larger EKF2_DELAY_MAX
             parameters = {n: value for n, value in trial.change.items() if n in PARAMETERS}
             actions += [set_parameters(analysis, parameters)] if parameters else []
     # KF actions are last, because the vehicle must be corrected first
@@ -284,7 +265,6 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, verdicts: Sequence[Verdict]
 ) -> str:
-    """Return the reason why a filter needs no change; an empty text if it was not evaluated."""
     words = {
         verdict.against: verdict.word
         for verdict in verdicts
@@ -315,7 +295,10 @@ def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
 def run_again(
     request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
 ) -> Action:
-    """Return the action to run KF with changed settings, or with equally good ``defaults``."""
+    """Return the command that runs KF with changed settings.
+
+    ``defaults`` are default settings that make KF consistent, too.
+    """
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
@@ -325,24 +308,15 @@ def run_again(
 
 
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
-    """Return the action to set EKF2 parameters in the MAVLink console."""
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
-    texts, commands, needs_reboot = [], [], False
+    texts, commands = [], []
     for name, value in change.items():
-        parameter = PARAMETERS[name]
-        change_text = (
-            f"{name} {flown_settings.get(name, math.nan):g} → {value:g} {parameter.printed_unit}"
-        )
-        texts.append(change_text.rstrip())
+        change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
+        texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
         commands.append(f"param set {name} {value:g}")
-        needs_reboot |= name.endswith(REBOOT_SUFFIXES)
-    return Action(
-        "EKF2",
-        ", ".join(texts),
-        (*commands, *(("reboot",) if needs_reboot else ())),
-        "console",
-    )
+    commands += ["reboot"] * any(name.endswith(REBOOT_SUFFIXES) for name in change)
+    return Action("EKF2", ", ".join(texts), tuple(commands), "console")
 
 
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
@@ -378,8 +352,7 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
         )
         prefix = "default " if kind == "defaults" else ""
         return f"KF, {prefix}{options}" if options else "KF"
-    others = [each for each in trials if each.filter == "ekf2"]
-    if len(others) < 2:
+    if sum(each.filter == "ekf2" for each in trials) < 2:
         return "EKF2 (replay)"
     return f"EKF2 (replay), {'sender' if kind == 'time offset' else 'parameters'}"
 
@@ -387,7 +360,6 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _closing_sentence(
     analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
-    """Return the sentence below a cause's table of re-runs; empty if none applies."""
     if alternatives:
         return (
             "Take only one of these actions: both correct the same time offset. Their signs "

@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from px4fuse.comparison.trials import Improvement
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share, Span
-from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
+from px4fuse.filter.consistency import Reference
 
 FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
@@ -16,21 +16,18 @@ VerdictWord = Literal["consistent", "overconfident", "underconfident", "not eval
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
 FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
-# Limits of the σ ratio of a consistent filter: against the source, and against ground truth
-SIGMA_RATIO_BANDS = CONSISTENT_RATIOS
-# Ends of the logarithmic axis of σ ratios; triangles at the ends show ratios beyond them
+# Limits of the logarithmic axis of σ ratios
 AXIS_ENDS = (0.1, 10.0)
-# Ticks of the logarithmic axis of σ ratios, with their labels
 AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Maximum number of causes on a card, which states the number of further causes
+# Maximum number of causes on a card
 MAX_CAUSES = 3
-# Maximum number of notes on the cover and the terminal, which state the number of further notes
+# Maximum number of notes on the cover and the terminal
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
 
 def axis_fraction(ratio: float) -> float:
-    """Return the place of a σ ratio on the logarithmic axis of the card (ends at 0 and 1).
+    """Map a σ ratio of 0.1 to 10 to a fraction of 0 to 1 of the logarithmic axis.
 
     >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
     (0.0, 0.5, 1.0)
@@ -40,25 +37,20 @@ def axis_fraction(ratio: float) -> float:
 
 
 class Verdict(Record, frozen=True, kw_only=True):
-    """Ratio of actual to reported σ of one filter, with its verdict.
+    """Verdict on the reported σ of KF or EKF2, from its innovations or its errors.
 
     Attributes
     ----------
-    filter : {"kf", "ekf2"}
     against : {"source", "truth"}
-        "source": RMS of innovation / √S; "truth": RMS of error / reported σ.
+        "source": innovations; "truth": errors against ground truth.
     ratio : float or None
         √(mean NIS) or √(mean NEES); above 1 the reported σ is too small.
     interval : (float, float) or None
-        95 % interval of the ratio: chi-square for the source, block bootstrap for ground truth.
-    word : str
-        Verdict on the reported σ.
-    samples : int
-        Number of innovations or errors.
+        95 % interval of the ratio.
     reason : str
-        Missing data, if the ratio is not evaluated.
+        Reason why the verdict is "not evaluated".
     is_explained : bool
-        True if the card explains the ratio and this filter needs no change.
+        True if the filter is inconsistent but needs no change.
     """
 
     filter: FilterName
@@ -71,26 +63,21 @@ class Verdict(Record, frozen=True, kw_only=True):
     is_explained: bool = False
 
     @property
-    def is_loud(self) -> bool:
-        """True if the filter is inconsistent and the card does not explain this."""
+    def is_fault(self) -> bool:
         return self.word in ("overconfident", "underconfident") and not self.is_explained
 
 
 class Effect(Record, frozen=True, kw_only=True):
-    """Position errors of KF and EKF2, their difference, and EKF2's rejections and resets.
+    """Position errors of KF and EKF2, and rejections and resets of EKF2.
 
     Attributes
     ----------
     axis : str
-        Main axis by name, with its reference ("along the main axis, 30° from north").
-    position_rmse_m, horizontal_rmse_m : mapping from "kf" and "ekf2" to float
-        Position RMSE against ground truth, along the axis and horizontally; empty without it.
+        Evaluated axis, for example "along the main axis, 30° from north".
+    position_rmse_m : mapping
+        Position RMSE against ground truth along this axis, of "kf" and "ekf2".
     difference_rms_m : float or None
-        RMS position difference KF - EKF2 along the axis.
-    rejected_fraction : float or None
-        Fraction of the positions that EKF2 rejected.
-    horizontal_resets : int or None
-        Number of horizontal resets of EKF2.
+        Position difference KF - EKF2 along this axis.
     """
 
     axis: str
@@ -107,14 +94,11 @@ class Action(Record, frozen=True):
     Attributes
     ----------
     target : str
-        Device, person or filters that have to change.
+        Device or filter to be changed.
     sentence : str
-        Action as an imperative, or "no change: <reason>"; may be empty with commands.
-    commands : tuple of str
-        Complete lines; a shell command contains the name of the log.
+        Imperative, or "no change: <reason>".
     where : {"shell", "console", ""}
-        Place where the commands are typed: the shell of the computer, or the MAVLink console;
-        empty without commands.
+        Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """
 
     target: Target
@@ -124,18 +108,16 @@ class Action(Record, frozen=True):
 
 
 class Rerun(Record, frozen=True, kw_only=True):
-    """Statistics of KF or EKF2 as flown, and run again with one change.
+    """Statistics of KF or EKF2 before and after one change of a setting or of the data.
 
     Attributes
     ----------
     label : str
         Filter and change: "KF without the 26 outliers", "EKF2 (replay)".
     is_prediction : bool
-        True for a replay of EKF2, which starts at ``from_s``; False for KF.
-    position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        Value as flown, and value with the change; None if unknown.
-    improves : str
-        Quantities that the change improves.
+        True for a replay of EKF2, False for a run of KF.
+    from_s : float or None
+        Start of the replay (s).
     """
 
     label: str
@@ -149,26 +131,20 @@ class Rerun(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """Cause on the card: fault with its magnitude, effect, actions and re-runs.
+    """Fault of the flight with its effect, actions and re-runs.
 
     Attributes
     ----------
-    id : str
-        Id of the finding.
-    severity : {"error", "warning"}
-    title : str
-        Fault and its size.
     why : str
         Effect of the fault on KF and EKF2.
     spans_s : tuple of (float, float)
         Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Groups of actions that exclude each other; one group is sufficient.
+        Groups of actions, of which the user selects one group.
     actions : tuple of Action
-        Actions that are necessary with each alternative.
-    reruns : tuple of Rerun
+        Actions that are always necessary.
     after : str
-        Sentence below the table of re-runs, for example on an equally good value.
+        Sentence below the table of re-runs.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -183,7 +159,7 @@ class Cause(Record, frozen=True, kw_only=True):
 
 
 class Note(Record, frozen=True):
-    """Finding of severity "note" as a sentence, with its action if it has one."""
+    """Finding of severity "note"."""
 
     id: str
     text: str
@@ -191,23 +167,20 @@ class Note(Record, frozen=True):
 
 
 class Identity(Record, frozen=True, kw_only=True):
-    """Flight, settings of KF and EKF2, and author of a card.
+    """Flight, software versions and settings that a card describes.
 
     Attributes
     ----------
-    file, firmware, hardware : str
-    duration_s : float
     source : str
-        Sensor and rate of the position source: "UWB 5.0 Hz".
+        Position source, for example "UWB 5.0 Hz".
     settings : str
-        SIGMA_A, SIGMA_Z and DT of KF with their origin.
+        SIGMA_A, SIGMA_Z and DT of KF.
     changed : tuple of str
-        Options of KF that differ from their default: "--sigma-a 0.001 (default 0.5)".
+        Settings of KF that differ from the default: "--sigma-a 0.001 (default 0.5)".
     parameters : tuple of str
-        Noise, delay and gate of EKF2 for the source that differ from PX4's default.
+        EKF2 parameters of the source that differ from PX4's default.
     segment : str
-    command : str
-    student, student_id, version : str
+        Analysed time span.
     """
 
     file: str
@@ -226,9 +199,9 @@ class Identity(Record, frozen=True, kw_only=True):
 
 
 class AidRow(Record, frozen=True, kw_only=True):
-    """RMS ratio of innovation to √S along one axis (``component``) of an aiding source.
+    """RMS of innovation ÷ √S along one axis of an EKF2 aiding source.
 
-    ``is_usual`` is True if a ratio below its band is usual with PX4's default noises.
+    ``is_usual`` is True if PX4's default noise of this aiding source is usually too large.
     """
 
     label: str
@@ -238,37 +211,20 @@ class AidRow(Record, frozen=True, kw_only=True):
 
 
 class Card(Record, frozen=True, kw_only=True):
-    """Diagnosis of a flight: fault, effect, actions, verdicts and causes.
+    """Diagnosis of a flight: headline, effect, actions, verdicts and causes.
 
     Attributes
     ----------
-    severity : str
-        Severity of the first cause. Without a cause: "note" with an unexplained inconsistent
-        verdict, else "clean"; "refused" for a log that cannot be analysed.
-    id : str
-        Id of the first cause, or of the error that prevents an analysis; else empty.
-    headline : str
-        First cause with its magnitude, or the result without a cause.
-    effect : Effect or None
-    effect_text : str
-        Effect in sentences, made from ``effect`` and ``verdicts``.
     do_this : tuple of str
-        The one to three most important actions; without a fault "Change nothing.".
-    verdicts : tuple of Verdict
-        KF and EKF2, each against source and ground truth; empty without a position source.
+        The most important actions.
     reconcile : str
-        Explanation if two verdicts of one filter differ.
+        Explanation if two verdicts on one filter differ.
     difference : str
         Position difference KF - EKF2 before and after the first fix.
-    causes : tuple of Cause
     more_causes : int
-        Number of further causes, which the card does not list.
-    notes : tuple of Note
-    aids : tuple of AidRow
-        Ratios of the aiding sources, on a flight without a position source.
+        Number of causes that the card does not list.
     facts : mapping from label to str
-        Texts on data that cannot be analysed, for example bytes read, and fix.
-    identity : Identity
+        Other texts, for example the fix for a log that cannot be read.
     """
 
     severity: CardSeverity

@@ -1,7 +1,7 @@
-"""Ratios of actual to reported uncertainty, and the verdicts on them.
+"""Verdicts on the reported σ of KF and EKF2.
 
-Against the source the ratio is √(mean NIS) over the innovations of the segment. Against ground
-truth it is √(mean NEES) at the times of EKF2's published position.
+The ratio of actual to reported σ is √(mean NIS) against the position source, and √(mean NEES)
+against ground truth.
 """
 
 import numpy as np
@@ -10,11 +10,7 @@ from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import (
-    Reference,
-    classify_ratio,
-    ratio_interval,
-)
+from px4fuse.filter.consistency import Reference, classify_ratio, ratio_interval
 from px4fuse.flight.model import Unavailable
 
 # Length (s) of the bootstrap blocks: longer than the correlation time of position errors
@@ -37,13 +33,11 @@ def _against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
     statement = result.filters[filter_name]
     if not isinstance(statement, FilterSummary):
         return _not_evaluated(filter_name, "source", statement)
-    ratio = statement.sigma_ratio
-    interval = ratio_interval(statement.nis_mean, statement.nis_band)
     return Verdict(
         filter=filter_name,
         against="source",
-        ratio=ratio,
-        interval=interval,
+        ratio=statement.sigma_ratio,
+        interval=ratio_interval(statement.nis_mean, statement.nis_band),
         word=statement.verdict,
         samples=statement.count,
     )
@@ -78,16 +72,9 @@ def _not_evaluated(
 
 
 def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | None:
-    """Return the 95 % interval of an RMS of correlated values, by block bootstrap.
+    """Return the 95 % interval of the RMS of correlated values, or None for a short flight.
 
-    Return None for fewer than MIN_BOOTSTRAP_BLOCKS blocks. The seed is fixed, so that the result is
-    repeatable. Künsch (1989), Annals of Statistics 17(3).
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Increasing times of the values.
-    values : ndarray, shape (n,)
+    Block bootstrap: Künsch (1989), Annals of Statistics 17(3).
     """
     block_count = int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_S) if len(time_s) > 1 else 0
     if block_count < MIN_BOOTSTRAP_BLOCKS:

@@ -16,7 +16,7 @@ from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
 
 FAILED_STATUS = "failed"
-# Types of clusters for which --scheduler NAME prints instructions, from NAME.txt in this folder
+# Types of clusters for which px4fuse prints instructions (NAME.txt in this folder)
 CLUSTERS = ("slurm", "kubernetes")
 
 

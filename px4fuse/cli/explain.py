@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import click
@@ -59,20 +58,14 @@ def _finding_page(finding_id: str) -> Page:
     for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
         if names:
             page.write_labelled(label, ", ".join(names))
-    page.write_labelled(
-        "Rates", *_rates(example.clean_flights, example.false_alarms, example.detection)
-    )
+    rates = ["False alarms and detection are not measured for this finding."]
+    if example.clean_flights:
+        rate_texts = [f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()]
+        rates = [
+            f"False alarms occurred on {example.false_alarms} of {example.clean_flights} simulated "
+            "flights without an injected fault.",
+            "Fraction of simulated flights on which the injected fault is detected: "
+            f"{'; '.join(rate_texts)}.",
+        ]
+    page.write_labelled("Rates", *rates)
     return page
-
-
-def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:
-    if not clean_flights:
-        return ["False alarms and detection are not measured for this finding."]
-    detected = "; ".join(
-        f"{mistake}: {100.0 * fraction:.0f} %" for mistake, fraction in detection.items()
-    )
-    return [
-        f"False alarms occurred on {false_alarms} of {clean_flights} simulated flights without an "
-        "injected fault.",
-        f"Fraction of simulated flights on which the injected fault is detected: {detected}.",
-    ]

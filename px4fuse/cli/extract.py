@@ -83,12 +83,8 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
         earlier_log = json.loads(text)["log"]
         is_other_log = earlier_log["sha256"] != sha256
         name = str(earlier_log["name"])
-    except (
-        OutputError,
-        ValueError,
-        KeyError,
-        TypeError,
-    ):  # the file is not a flight.json of px4fuse
+    # the file does not exist, or is not a flight.json of px4fuse
+    except (OutputError, ValueError, KeyError, TypeError):
         return
     if is_other_log:
         raise OutputError(

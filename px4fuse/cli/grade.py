@@ -73,6 +73,27 @@ if TYPE_CHECKING:
     "each started day.  [default: no deduction]",
 )
 @click.option(
+    "--grace",
+    type=click.FloatRange(0.0, 10_080.0),
+    metavar="MINUTES",
+    default=0.0,
+    help="Maximum delay without a deduction.",
+)
+@click.option(
+    "--scale",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="POINTS",
+    help="Maximum points on the learning platform, to which the grades in --worksheet are scaled.  "
+    "[default: the points of the rubric]",
+)
+@click.option(
+    "--questions",
+    type=click.IntRange(1, 10),
+    metavar="N",
+    help="Write questions.txt: N questions to each student for an oral check, from the student's "
+    "own form and flight, with the expected answers. Requires --key.",
+)
+@click.option(
     "--include-pending",
     is_flag=True,
     help="Count points that the instructor has not confirmed yet.",
@@ -117,6 +138,9 @@ def grade(
     attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
+    grace: float,
+    scale: float | None,
+    questions: int | None,
     include_pending: bool,
     worksheet: tuple[Path, ...],
     column: str | None,
@@ -144,6 +168,8 @@ def grade(
     late_deduction = parse_late_rule(late) if late else None
     if late_deduction is not None and due is None:
         raise SettingsError("--late requires --due TIME.")
+    if questions and key is None:
+        raise SettingsError("--questions requires --key FILE.json.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
@@ -161,6 +187,9 @@ def grade(
         attempt=attempt,
         due=parse_due_time(due) if due else None,
         late_rule=late_deduction,
+        grace_s=60.0 * grace,
+        scale=scale,
+        question_count=questions or 0,
         include_pending=include_pending,
         anonymous=anonymous,
     )

@@ -30,13 +30,13 @@ MAX_LANDING_DISTANCE_M = 10_000.0
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
-def _parse_numbers(text: str, expected: str, max_absolute: float) -> list[float]:
+def _parse_numbers(text: str, syntax: str, max_absolute: float) -> list[float]:
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or not all(abs(number) <= max_absolute for number in numbers):
-        raise click.BadParameter(f"The value {text!r} is not {expected}.")
+        raise click.BadParameter(f"The value {text!r} is not {syntax}.")
     return numbers
 
 
@@ -158,9 +158,9 @@ def loop(
 ) -> None:
     """Measure and correct the loop closure error of odometry.
 
-    SOURCE is a flight log (its VIO, or EKF2; LOG:vio, LOG:ekf2 and LOG:kf select the track), a
-    trajectory (TUM, EuRoC, ORB-SLAM3, KITTI, BAG:TOPIC), or a pose graph (g2o), which is optimised.
-    Writes a PDF report and the results as JSON, except for a pose graph.
+    SOURCE is a flight log, a trajectory (TUM, EuRoC, ORB-SLAM3, KITTI, BAG:TOPIC), or a pose graph
+    (g2o), which is optimised. LOG:vio, LOG:ekf2 or LOG:kf selects the track of a log; the default
+    is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
     from px4fuse.core.reading import split_part
     from px4fuse.diagnose import analyse_loop_closure
@@ -168,14 +168,14 @@ def loop(
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    log = split_part(str(source))[0]
+    log = split_part(str(source))[0]  # without the name of the track
     student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
                 f"{name} cannot write to standard output, only --json can", "Give a file name."
             )
-    if is_g2o(split_part(str(source))[0]):
+    if is_g2o(log):
         _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
         return
     request = loop_request(source, option_values)
@@ -201,7 +201,7 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
-    """Return the file contents of the corrected path (TUM) and the optimised pose graph (g2o)."""
+    """Return the contents of the files with the corrected path (TUM) and the pose graph (g2o)."""
     from px4fuse.errors import MissingDataError
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text

@@ -77,22 +77,16 @@ class InputPath(NonEmptyPath):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = super().convert(value, param, ctx)
-        file, colon, _ = str(path).rpartition(":")
-        add_input(Path(file) if colon and not Path(path).exists() else Path(path))
+        file, separator, _ = str(path).rpartition(":")
+        add_input(Path(file) if separator and not Path(path).exists() else Path(path))
         return path
 
 
 class TypedQuantity(click.ParamType["float | str"]):
-    """Option type of a number in a fixed unit.
+    """Option type of a number in a fixed unit of :data:`px4fuse.core.units.UNIT_NAMES`.
 
-    Parameters
-    ----------
-    unit : str
-        One of :data:`px4fuse.core.units.UNIT_NAMES`.
-    example : float
-        Number that the error message suggests if the typed text is not a number.
-    auto : bool
-        True to accept the text "auto" in addition.
+    The error for a text that is not a number suggests ``example``. If ``auto`` is True, the text
+    "auto" is also accepted.
     """
 
     name = "number"
@@ -115,9 +109,9 @@ class TypedQuantity(click.ParamType["float | str"]):
             number = float(value)
         except ValueError:
             converted = convert_to_unit(value, self.unit)
-            example_text = f"{self.example if converted is None else converted:.12g}"
+            example = self.example if converted is None else converted
             self.fail(
-                f"{value!r} is not a number{unit}. Give for example {example_text}"
+                f"{value!r} is not a number{unit}. Give for example {example:.12g}"
                 f"{', or auto' if self.auto else ''}.",
                 param,
                 ctx,
@@ -164,10 +158,7 @@ def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
 
 
 def output_option(metavar: str, text: str, **details: Any) -> Option:
-    """Declare -o for an output file or folder.
-
-    Further arguments of ``click.option`` are in ``details``.
-    """
+    """Declare -o for an output file or folder; ``details`` are arguments of ``click.option``."""
     return click.option(
         "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
     )

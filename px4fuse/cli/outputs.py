@@ -46,18 +46,11 @@ GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
 class Interrupted(Exception):  # noqa: N818 - no error, because the user ends the run
-    """End of a run by Ctrl-C or a termination signal.
-
-    Parameters
-    ----------
-    interrupt : KeyboardInterrupt
-        Its argument is the number of the signal, except for Ctrl-C.
-    files_sentence : str
-        Sentence that lists the files that the run has written.
-    """
+    """End of a run by Ctrl-C or a termination signal, with a sentence on the written files."""
 
     def __init__(self, interrupt: KeyboardInterrupt, files_sentence: str) -> None:
         super().__init__(f"interrupted; {files_sentence}")
+        # the argument of the interrupt is the number of the signal, except for Ctrl-C
         self.exit_code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
@@ -70,12 +63,12 @@ class ShowProgress(Protocol):
 
 
 def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-    """Show no progress, in place of a function that shows the activity of a run."""
+    """Ignore the progress of a run."""
 
 
 @contextmanager
 def progress(output: Path | None = None) -> Iterator[ShowProgress]:
-    """Provide a function that shows progress: current activity, counts and remaining time (s).
+    """Provide a function that shows the progress on a terminal.
 
     In a pipe, or if ``output`` is standard output, the function shows nothing.
     """
@@ -109,7 +102,7 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
 
 def default_report(stem: str, settings: str, results: Results) -> Path:
-    """Return the default path of a report, which consists of the log name and changed settings.
+    """Return the default path of a report: name of the log, and settings that are not defaults.
 
     Raises
     ------
@@ -124,9 +117,10 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
-    kind = "a report on the same input files and student by this version of px4fuse"
-    _check_default(path, kind, partial(_is_same_report, results, attached_results))
-    _check_default(path.with_suffix(".json"), kind, partial(_is_same_report, results, read_results))
+    fault = "it is not a report on the same input files and student by this version of px4fuse"
+    _check_default(path, fault, partial(_is_same_report, results, attached_results))
+    json_path = path.with_suffix(".json")
+    _check_default(json_path, fault, partial(_is_same_report, results, read_results))
     return path
 
 
@@ -139,18 +133,18 @@ def check_default_page(path: Path, page: str) -> None:
         A file with this path exists and is not a web page of the same command and log.
     """
     generator = GENERATOR.findall(page)
-    kind = "a web page of the same command and log by this version of px4fuse"
-    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == generator)
+    fault = "it is not a web page of the same command and log by this version of px4fuse"
+    _check_default(path, fault, lambda content: GENERATOR.findall(content.decode()) == generator)
 
 
-def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool]) -> None:
+def _check_default(path: Path, fault: str, is_replaceable: Callable[[bytes], bool]) -> None:
     try:
         may_replace = not path.exists() or is_replaceable(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
         may_replace = False
     if not may_replace:
         raise OutputError(
-            f"{path} exists and is not {kind}; it was not overwritten",
+            f"{path} exists and was not overwritten, because {fault}",
             "Choose another name with -o.",
         )
 
@@ -192,8 +186,7 @@ def web_page(output: Path | None, default: Path) -> Path:
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Return the paths of a report (PDF) and its results (JSON), from the values of -o and --json.
 
-    Without --json the results are written beside the report. Without -o the list does not contain
-    the report, because its name is determined after the analysis.
+    Without -o, the list does not contain the report, whose name is determined after the analysis.
 
     Raises
     ------
@@ -204,7 +197,7 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
         raise OutputError(f"{output}: the output is a PDF. Give a name ending in .pdf (-o).")
     results_path = json_path
     if output is not None and json_path in (None, STANDARD_OUTPUT):
-        results_path = output.with_suffix(".json")
+        results_path = output.with_suffix(".json")  # beside the report
     paths = [path for path in (output, results_path) if path is not None]
     check_targets(paths)
     return paths
@@ -219,14 +212,7 @@ def result_files(
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by their paths.
 
-    Parameters
-    ----------
-    results : Struct or dict
-    json_path, output : Path or None
-        Values of --json and -o.
-    analysis : object, optional
-        Analysis that the report shows; without an analysis no report is made.
-    show_progress : callable
+    Without ``analysis``, no report is made.
     """
     from px4fuse.results.contract import to_json
 
@@ -314,9 +300,9 @@ def write_and_print(
     page : Page, optional
         Results to print.
     request : Request, optional
-        Request of the analysis, whose files and options complete the printed commands.
+        Request with the files and options that printed commands contain.
     written_files : iterable of Path
-        Files that the command has already written; their names are printed too.
+        Files that the command has already written.
     """
     from px4fuse.report.screen import print_line, show
 
@@ -345,8 +331,7 @@ def show_page(page: Page, *, is_error: bool = False) -> None:
 def terminal(*, is_error: bool = False) -> Console:
     """Return a console; it raises BrokenPipeError if the reader of standard output has ended.
 
-    Lines have the width of the terminal. In a pipe a paragraph is one line, unless the environment
-    variable COLUMNS contains a width (characters).
+    In a pipe, a paragraph is one line unless the environment variable COLUMNS contains a width.
     """
     from rich.console import Console
 

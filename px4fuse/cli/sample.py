@@ -24,20 +24,18 @@ def sample_log() -> Path:
 
     from px4fuse.errors import MissingDataError
 
-    local_path = SAMPLES_FOLDER / SAMPLE_LOG
-    if local_path.is_file():
-        sample_path = local_path
-    else:
+    path = SAMPLES_FOLDER / SAMPLE_LOG
+    if not path.is_file():
         try:
-            with as_file(files("px4fuse_samples") / SAMPLE_LOG) as installed:
-                sample_path = installed
+            with as_file(files("px4fuse_samples") / SAMPLE_LOG) as path:
+                pass
         except ModuleNotFoundError:
             raise MissingDataError(
                 "No log was given, and the sample logs are not installed.",
                 f"Give the path of a log, or run {INSTALL_COMMAND}.",
             ) from None
     click.echo(f"No log was given: the sample log {SAMPLE_LOG} is used.", err=True)
-    return sample_path
+    return path
 
 
 @click.command()

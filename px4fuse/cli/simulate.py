@@ -75,7 +75,7 @@ class WithMistakes(click.Command):
     """Command of click whose help ends with the table of injected faults."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Injected faults for --mistake [default VALUE]"):
+        with formatter.section("Injected faults for --mistake [the default VALUE is in brackets]"):
             formatter.write_dl(
                 [
                     (
@@ -150,7 +150,8 @@ class WithMistakes(click.Command):
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes along the aisle [6], or of laps of the square [1; outdoors 3].",
+    help="Number of passes along the aisle, or of laps of the square.  [default: 6 passes, 1 lap; "
+    "outdoors 3 laps]",
 )
 @click.option(
     "--yaw",
@@ -221,7 +222,7 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Reject options that exclude --assignment, or that require it if it is missing."""
+    """Reject options that cannot be combined with --assignment, or that need it."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR_KIND:
         raise SettingsError(
             f"--kind {OUTDOOR_KIND} is not available with --assignment.",
@@ -265,7 +266,7 @@ def _write_assignment(
     truth: bool,
     preview: bool,
 ) -> None:
-    """Write one flight per student and the answer key; with ``preview``, only print the flights."""
+    """Write one flight per student and the answer key, or only print the flights (``preview``)."""
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.random_assignment import (
         EASIEST_DIFFICULTY,
@@ -330,9 +331,9 @@ def _write_assignment(
         {
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
             "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-            "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: smallest size of a fault that "
-            "px4fuse detects in 19 of 20 flights, divided by the size in the flight",
+            "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
+            f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
+            "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
             **closing_texts,
         }
     )
@@ -343,23 +344,23 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     from px4fuse.report.page import Page
 
     scenario, page = simulation.scenario, Page()
-    names = active_mistakes(simulation.mistakes)
-    loop, plural = scenario.kind == "loop", scenario.passes > 1
-    path = f"{scenario.passes} lap{'s' * plural} of a square of {scenario.length_m:g} m"
+    has_several = scenario.passes > 1
+    path = f"{scenario.passes} lap{'s' * has_several} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
-        path = f"{scenario.passes} pass{'es' * plural} of {scenario.length_m:g} m"
-    page.write_labelled_texts(
-        {
-            "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-            f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-            "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
-            f"{scenario.source_rate_hz:g} Hz"
-            + (f", VIO drift {scenario.vio_drift:.1%} of the path" if loop else ""),
-            "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
-        }
-    )
+        path = f"{scenario.passes} pass{'es' * has_several} of {scenario.length_m:g} m"
+    texts = {
+        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
+        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
+        "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+        f"{scenario.source_rate_hz:g} Hz",
+    }
+    if scenario.kind == "loop":
+        texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the path"
+    texts["IMU"] = f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
+    page.write_labelled_texts(texts)
     mistake_texts = [
-        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
+        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}"
+        for name in active_mistakes(simulation.mistakes)
     ]
     page.write_labelled("Faults", *(mistake_texts or ["none"]))
     page.write_labelled("Truth", "logged" if scenario.truth else "not logged")

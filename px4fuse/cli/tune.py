@@ -20,15 +20,15 @@ TUNING_HEAD = (
     "axis",
     "SIGMA_A (m/s²)\nvalue, 95 %",
     "SIGMA_Z (m)\nvalue, 95 %",
-    "\ngain",
-    "held\nout",
-    "lag 1\nbefore after",
+    "log-likelihood\ngain (nats)",
+    "gain on\n2nd half",
+    "autocorrelation\nbefore, after",
 )
 TUNING_NOTE = (
-    "gain: increase of the log-likelihood per measurement (nats) from the chosen settings to the "
-    "estimates. held out: gain on the second half of the data with noises estimated on the first "
-    "half. lag 1: autocorrelation of the innovations at lag 1, with the chosen settings and with "
-    "the estimates."
+    "The log-likelihood gain is the increase per measurement from the chosen settings to the "
+    "estimates. For the gain on the 2nd half of the data, the noises are estimated on the first "
+    "half. The autocorrelation of the innovations is at lag 1, with the chosen settings (before) "
+    "and with the estimates (after)."
 )
 
 
@@ -74,28 +74,20 @@ def _page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) 
         if isinstance(tuning, Unavailable):
             sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
             continue
-        validation, consistencies = tuning.held_out, (tuning.before, tuning.after)
-        lags = [
-            f"{consistency.lag1_autocorrelation:+.2f}"
-            for consistency in consistencies
-            if not isinstance(consistency, Unavailable)
-        ]
-        lag_text = " ".join(lags) if len(lags) == len(consistencies) else ""
-        held_out_gain = (
-            ""
-            if isinstance(validation, Unavailable)
-            else f"{validation.log_likelihood_gain_per_measurement:+.3f}"
-        )
-        noises = [
-            format_noise_estimate(noise) for noise in (tuning.sigma_a_two_state, tuning.sigma_z)
-        ]
+        held_out_gain = correlation_text = ""
+        if not isinstance(tuning.held_out, Unavailable):
+            held_out_gain = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
+        if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
+            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
+            correlation_text = f"{before:+.2f} {after:+.2f}"
         rows.append(
             [
                 name,
-                *noises,
+                format_noise_estimate(tuning.sigma_a_two_state),
+                format_noise_estimate(tuning.sigma_z),
                 f"{tuning.log_likelihood_gain_per_measurement:.3f}",
                 held_out_gain,
-                lag_text,
+                correlation_text,
             ]
         )
     page.write_labelled("Chosen", format_settings(comparison.settings))

@@ -91,8 +91,8 @@ def whatif(
 def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
     changes: dict[str, float] = {}
     for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals:
+        name, separator, value = text.partition("=")
+        if not separator:
             raise SettingsError(
                 f"--set {text} is not NAME=VALUE. Give for example --set EKF2_EVP_NOISE=0.1."
             )

@@ -1,9 +1,7 @@
-"""Causes of an inconsistent filter, found by re-running the filter with one change at a time.
+"""Search for the cause of an inconsistent filter: re-run the filter with one change at a time.
 
-A discrepancy of a filter is a mean NIS outside its band, or a mean NEES that shows errors larger
-than the reported σ. The filter is re-run with each change that may explain the discrepancy. If no
-change alone explains it, the best change is combined with each other change.
-:func:`px4fuse.comparison.trials.find_cause` chooses the cause from the re-runs.
+KF and EKF2 are re-run with each candidate change (:mod:`px4fuse.comparison.changes`). If no single
+change makes the filter consistent, the best change is combined with each other one.
 """
 
 from __future__ import annotations
@@ -72,16 +70,15 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Maximum mean NIS for a position error above the reported σ that innovations do not show
-MAX_UNREMARKABLE_NIS = 1.5
-# Columns of the updates of an EKF2 replay, for north and east
-INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
+# Maximum mean NIS of innovations that look normal
+MAX_NORMAL_NIS = 1.5
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
 )
-# Maximum ratio of a statistic (RMSE, σ ratio) of the logged EKF2 and of its replay, to use the log
+# Maximum ratio between a statistic (RMSE, σ ratio) of the logged EKF2 and of the replayed EKF2.
+# With a larger ratio, replays with changes are compared with the replay as flown instead of the log
 MAX_REPLAY_FACTOR = 1.10
 
 
@@ -97,16 +94,16 @@ class ErrorAboveSigma(NamedTuple):
 def error_above_reported_sigma(
     summary: FilterSummary | UntestedFilter,
 ) -> ErrorAboveSigma | None:
-    """Return the position error of a filter if it exceeds σ and innovations do not show it.
+    """Return the position error of a filter if it exceeds the reported σ and the NIS is normal.
 
-    Innovations that are not logged along the axis do not show it either.
+    A filter without innovations along the axis has no NIS, which also hides the error.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or truth.is_lag_only or (nis_mean or 0.0) >= MAX_UNREMARKABLE_NIS:
+    if nees < MIN_NEES_FINDING or truth.is_lag_only or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
@@ -119,11 +116,9 @@ class Reruns:
     Attributes
     ----------
     ekf2_model : Model or Unavailable
-        Model of EKF2 for replays; its ``agreement`` compares the replay as flown with the log.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Difference KF - EKF2 in steps, each of which replaces one property of KF by that of EKF2.
     trials : tuple of Trial
-        Re-runs along the main axis, and along each axis with a discrepancy.
+        Re-runs along the main axis and along each axis with an inconsistent filter.
     """
 
     ekf2_model: Model | Unavailable
@@ -131,14 +126,11 @@ class Reruns:
     trials: tuple[Trial, ...]
 
 
-Rerun = Callable[[AxisComparison, Change], RunStatistics]
-
-
 class _Filter(NamedTuple):
-    """KF or EKF2, with the function that re-runs it with a change; only EKF2 has a ``model``."""
+    """KF or EKF2, and the function that re-runs it with a change; ``model`` is None for KF."""
 
     name: FilterName
-    rerun: Rerun
+    rerun: Callable[[AxisComparison, Change], RunStatistics]
     model: Model | None = None
 
     @property
@@ -149,14 +141,9 @@ class _Filter(NamedTuple):
 def run_interventions(
     comparison: Comparison, estimates: Estimates, model: Model | Unavailable
 ) -> tuple[Trial, ...]:
-    """Re-run KF and EKF2 along each axis with each change that may explain a discrepancy.
+    """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    estimates : Estimates
-    model : Model or Unavailable
-        Model of EKF2 in the same flight; without it only KF is re-run.
+    EKF2 is re-run only if its replay agrees with the log and it fused the analysed source.
     """
     filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
     if (
@@ -204,7 +191,7 @@ def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[Filt
 def _changes_along(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None, result: AxisComparison
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return the changes for re-runs along an axis, with the discrepancies each may explain."""
+    """Return each change to try along an axis, with the statistics that it may correct."""
     summary = result.filters["kf" if inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         inputs is not None and result.axis.name == "down"
@@ -231,7 +218,6 @@ def _changes_along(
 def _try_changes(
     comparison: Comparison, estimates: Estimates, each: _Filter, result: AxisComparison
 ) -> list[Trial]:
-    """Re-run a filter with each change, and with pairs of changes if none is sufficient."""
     changes = _changes_along(comparison, estimates, each.inputs, result)
     if not changes:
         return []
@@ -265,10 +251,7 @@ def _try_changes(
 
 
 def _flown_statistics(each: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter as flown, and True unless they are of an EKF2 replay.
-
-    EKF2's statistics are from the log if a replay of EKF2 as flown has nearly the same statistics.
-    """
+    """Return the statistics of a filter as flown, and True if they are from the log or from KF."""
     replayed, logged = each.rerun(result, {}), result.ekf2_state
     if each.model is None:
         return replayed, True
@@ -321,7 +304,6 @@ def _statistics(
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    """Rotate a direction in NED into the frame of positions that are rotated clockwise."""
     return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
 
 
@@ -341,8 +323,7 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if is_gnss_rotation:
-            # GNSS and ground truth refer to true north, so the attitude is misaligned: rotate both
-            # of them
+            # rotating GNSS positions and ground truth has the effect of a corrected heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS in change:
@@ -406,14 +387,13 @@ def _replay_statistics(
     result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    """Return the statistics of an EKF2 replay along an axis."""
     compared_s, axis = model.flown.evaluated_s, result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
-        # this change corrects the attitude, so the direction of the axis from north does not change
+        # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     weights, updates = axis.direction[:2], ekf2_replay.updates
     updates = updates[inside_spans(updates.index, compared_s)]
-    innovation_variance_m2 = weighted_sum(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
+    innovation_variance_m2 = weighted_sum(updates, UPDATE_COLUMNS[2:4], weights**2)
     prior_m2 = innovation_variance_m2 - weighted_sum(updates, OBSERVATION_VARIANCES, weights**2)
     posterior_m2 = weighted_sum(updates, POSITION_VARIANCES, weights**2)
     variance = pd.DataFrame(
@@ -429,7 +409,7 @@ def _replay_statistics(
     if not change and not isinstance(logged, Unavailable):
         compared = logged[inside_spans(logged.index, compared_s)]
     return _statistics(
-        weighted_sum(updates, INNOVATION_COLUMNS, weights),
+        weighted_sum(updates, UPDATE_COLUMNS[:2], weights),
         innovation_variance_m2,
         error_statistics(published, variance, result.truth),
         difference(result.replay, compared),

@@ -1,6 +1,6 @@
-"""Changes of a filter or of its data that may explain a discrepancy; re-runs test the changes.
+"""Candidate changes of KF, of EKF2 or of their data, to be tested by re-runs.
 
-Functions with the parameter ``inputs`` return changes of EKF2, or changes of KF if it is None.
+The parameter ``inputs`` is None for changes of KF.
 """
 
 from collections.abc import Iterable
@@ -29,10 +29,10 @@ from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
-# Minimum SIGMA_Z (m) of a KF re-run: accuracy of motion capture in flight
+# Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of change of KF (:attr:`Trial.kinds`), by the key of :attr:`Trial.change`
+# Kind of each change of KF (:attr:`Trial.kinds`)
 KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -45,7 +45,7 @@ KF_KINDS = {
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
-# SIGMA_A contains tilt error and bias, too
+# SIGMA_A also covers tilt error and bias
 VIBRATION_FACTOR = 3.0
 # EKF2 parameters for which a re-run uses PX4's default, if the flight had another value
 PARAMETERS_OF_EKF2 = (
@@ -73,8 +73,8 @@ def candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     tuned = tuning_of_axis(estimates.tuning, result.axis.name)
     changes = list[Change]()
-    # innovations do not show slow errors of GNSS or of a drifting source: no reason for a smaller
-    # noise
+    # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
+    # smaller noise
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if tuned is not None and not (is_underconfident and hides_slow_errors):
         changes += (
@@ -102,10 +102,10 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes for re-runs along the main axis.
+    """Return the changes to try along the main axis, where more changes are tried.
 
-    In addition to :func:`candidate_changes`: for KF, both noises together and the default settings;
-    for EKF2 with a changed delay, the same shift of the position timestamps.
+    KF is also re-run with both noises changed and with its default noises. EKF2 is also re-run with
+    shifted timestamps if its delay parameter is wrong.
     """
     changes = unique_changes(
         change
@@ -128,7 +128,7 @@ def unique_changes(changes: Iterable[Change]) -> list[Change]:
 
 
 def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
-    """Classify a change for :attr:`.trials.Trial.kinds`."""
+    """Return the kinds of a change, for example ("noise",) or ("delay", "outliers")."""
     if inputs is None and change == default_settings(comparison):
         return ("defaults",)
     kinds: dict[str, str] = {}
@@ -142,7 +142,7 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 
 def default_settings(comparison: Comparison) -> Change:
-    """Return the default noises of KF for those settings that the user changed."""
+    """Return KF's default noises in place of the values that the user chose."""
     chosen, default = comparison.settings, Settings()
     names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -158,10 +158,9 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
 
 
 def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
-    """Return the estimated time offset, if its unapplied part is significant.
+    """Return the estimated time offset if a significant part of it is not yet applied.
 
-    EKF2 discards positions older than its fusion horizon, so the change may also lengthen the
-    horizon.
+    For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
     """
     clock = estimates.clock
     if isinstance(clock, Unavailable) or not clock.is_determinable:
@@ -176,7 +175,7 @@ def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
-    """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from the setting."""
+    """Return the noise estimates that differ significantly from the settings."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
         chosen_sigma = getattr(settings, name)
@@ -194,7 +193,6 @@ def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    """Return the estimated accelerometer bias, if significant; the re-run removes the bias."""
     fit = estimates.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or not fit.has_bias:
         return []
@@ -225,10 +223,10 @@ def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
 
 
 def _vibration_noise(settings: Settings, inputs: Inputs, tuned: AxisTuning) -> list[Change]:
-    """Return a larger EKF2_ACC_NOISE that covers the vibration, within PX4's range.
+    """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
 
-    EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds
-    SIGMA_A² · DT² in each DT.
+    EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
+    in each DT.
     """
     steps = settings.dt_s / inputs.step_s
     flown, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum

@@ -46,7 +46,7 @@ def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
         notes += [f"EKF2 {note}"] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # EKF2's state without resets has another frame than its positions at the fusion horizon
+            # the removed resets moved the origin, also of the positions at the fusion horizon
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
@@ -60,7 +60,6 @@ def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
 
 
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
-    """Compare KF and EKF2 along one axis; ``ekf2`` is already without resets of its frame."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     state, variance, truth = tracks.values()
@@ -238,7 +237,6 @@ def _horizon_nees(horizon: pd.DataFrame | None, truth: Frame) -> float | None:
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
-    """Return the errors of ``state`` against interpolated ground truth; NaN where unknown."""
     true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
     return np.asarray(state[column].to_numpy() - true)
 
@@ -257,14 +255,10 @@ def _mean_nees(normalised: Array) -> float | None:
 
 
 def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
-    """Return position errors (m) and reported σ (m) of one filter along an axis.
+    """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
-    The times are those of EKF2's published state; without EKF2, those of KF's predictions.
-
-    Returns
-    -------
-    DataFrame or Unavailable
-        Columns ``error_m`` (against ground truth) and ``sigma_m``; NaN where unknown.
+    The index is the time (s) of EKF2's published state or, without EKF2, of KF's predictions. The
+    columns are ``error_m`` and ``sigma_m``; NaN where unknown.
     """
     if isinstance(result.truth, Unavailable):
         return result.truth

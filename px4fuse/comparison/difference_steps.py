@@ -1,9 +1,8 @@
-"""Explanation of the difference KF - EKF2 along each horizontal axis.
+"""Explanation of the difference KF - EKF2 along each horizontal axis, in sentences.
 
-Each step of :mod:`px4fuse.ekf2.steps` replaces one property of KF by that of EKF2. After all
-steps, KF has become the logged EKF2. For the two steps with the largest effect, sentences state
-the behaviour of KF and EKF2, the fraction of the mean square difference, and the time of the
-largest effect.
+KF's settings and equations are replaced by those of EKF2, one at a time
+(:mod:`px4fuse.ekf2.steps`). The sentences describe the two replacements that reduce the difference
+most.
 """
 
 from collections.abc import Mapping
@@ -31,18 +30,19 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference of the position RMSEs of KF and EKF2 for the report to call them equal
+# Maximum relative difference between position RMSEs that the report calls equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference KF - EKF2 for a sentence on the second largest step
-MIN_NOTABLE_SHARE = 0.05
-# Minimum ratio of a KF noise setting to its estimate, or inverse, to correct the setting first
+# Minimum fraction of the mean square difference KF - EKF2 for a sentence on the second replacement
+MIN_NOTABLE_FRACTION = 0.05
+# Minimum factor between a KF noise setting and its estimate for a correction before the
+# replacements
 MIN_SETTING_RATIO = 4.0
-# Minimum position change (m) for the report to list an EKF2 property as a step
+# Minimum position change (m) by a replacement that the report lists
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum position difference KF - EKF2 (m) outside the replayed times for the report to state it
+# Minimum position difference KF - EKF2 (m) outside the replayed times for a sentence
 MIN_UNREPLAYED_M = 0.5
-# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to that inside, for
-# the report to state it
+# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to the largest one
+# inside, for a sentence
 MIN_UNREPLAYED_RATIO = 3.0
 
 
@@ -50,25 +50,13 @@ def explain_ekf2_difference(
     comparison: Comparison,
     model: Model | Unavailable,
     clock: ClockOffset | Unavailable,
-    corrected: Mapping[str, float],
+    corrected: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
-    """Explain the difference KF - EKF2 along each axis of a comparison.
+    """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    model : Model or Unavailable
-        EKF2 of the same flight.
-    clock : ClockOffset or Unavailable
-        Estimated age of the positions.
-    corrected : mapping from field of Settings to value
-        Estimates that replace wrong settings of KF before the first step
-        (:func:`corrected_settings`).
-
-    Returns
-    -------
-    mapping from axis name to DifferenceExplanation or Unavailable
-        Without a horizontal axis only "down", as Unavailable: EKF2 replays are horizontal.
+    ``corrected`` contains noise estimates that replace wrong settings of KF
+    (:func:`corrected_settings`). If only the down axis was analysed, the result is the reason why
+    it is not explained.
     """
     results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not results:
@@ -78,7 +66,7 @@ def explain_ekf2_difference(
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
     settings = _settings(comparison, model.inputs, corrected)
-    changed = _with_changes(comparison.settings, corrected)
+    changed = replace(comparison.settings, **corrected)
     runs = {
         name: replay(axis.axis, changed, fast=True) if corrected else axis.replay
         for name, axis in results.items()
@@ -88,26 +76,23 @@ def explain_ekf2_difference(
         return dict.fromkeys(results, explanations)
     reasons = _step_reasons(replace(comparison, settings=changed), model, clock)
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
-    for name, explanation in explanations.items():
-        with_unreplayed_part = structs.replace(
-            explanation,
+    for name, by_steps in explanations.items():
+        explanation = structs.replace(
+            by_steps,
             corrected=dict(corrected),
             steps=tuple(
-                step for step in explanation.steps if step.position_moved_m > MIN_STEP_EFFECT_M
+                step for step in by_steps.steps if step.position_moved_m > MIN_STEP_EFFECT_M
             ),
-            outside=_unreplayed_part(results[name], runs[name], explanation.spans_s),
+            outside=_unreplayed_part(results[name], runs[name], by_steps.spans_s),
         )
-        explanation_by_axis[name] = add_sentences(
-            with_unreplayed_part, comparison.axes[name].axis.label, reasons
-        )
+        explanation_by_axis[name] = add_sentences(explanation, results[name].axis.label, reasons)
     return explanation_by_axis
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return the noise estimates for those settings of KF that are far from their estimate.
+    """Return the noise estimates for those KF settings that are wrong by a large factor.
 
-    A wrong setting is a separate cause of the difference KF - EKF2. Without its correction, each
-    step alone would remove nearly the whole difference.
+    With such a setting, each replacement alone would remove nearly the whole difference KF - EKF2.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -126,7 +111,7 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
 
 
 def explanation_configurations(
-    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]
+    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
     return list(
@@ -134,16 +119,10 @@ def explanation_configurations(
     )
 
 
-def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
-    """Return the corrected settings of KF; the time offset is 0 if EKF2 fused another source."""
-    settings = _with_changes(comparison.settings, corrected)
+def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]) -> Settings:
+    settings = replace(comparison.settings, **corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
-
-
-def _with_changes(settings: Settings, changes: Mapping[str, float]) -> Settings:
-    values: dict[str, Any] = dict(changes)
-    return replace(settings, **values)
 
 
 def _unreplayed_part(
@@ -163,15 +142,15 @@ def _unreplayed_part(
 def add_sentences(
     explanation: DifferenceExplanation, axis_label: str, reasons: dict[str, str]
 ) -> DifferenceExplanation:
-    """Add sentences on the EKF2 properties that cause the difference KF - EKF2, largest first.
+    """Add sentences on the causes of the difference KF - EKF2, largest first.
 
     Parameters
     ----------
     explanation : DifferenceExplanation
     axis_label : str
-        Name of the axis in sentences, for example "the main axis".
+        For example "the main axis".
     reasons : dict
-        Clauses on the different behaviour of KF and EKF2, by name of the step.
+        Different behaviour of KF and EKF2, by the name of the replaced property.
     """
     reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
     first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
@@ -185,11 +164,11 @@ def add_sentences(
             f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
         )
         sentences.append(
-            f"The wrong noise setting of KF is corrected first ({settings}), and the steps "
-            "explain the remaining difference KF - EKF2."
+            f"KF is first run again with the estimated noise ({settings}). The following "
+            "sentences explain the remaining difference KF - EKF2."
         )
     sentences.append(f"{cause} {_effect_text(first, explanation)}")
-    if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
+    if second.position_mean_square_m2 >= MIN_NOTABLE_FRACTION * explanation.position_mean_square_m2:
         sentences.append(
             f"Second largest contribution: {second.name}. {reasons[second.name]}. "
             f"{_effect_text(second, explanation)}"
@@ -209,13 +188,12 @@ def add_sentences(
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
     share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    share_text = f"{100 * share:.0f} % of the mean square difference KF - EKF2"
-    # the fractions of all steps add up to 100 %, so those of other steps are negative
-    if share > 1.0:
-        share_text = "more than the mean square difference KF - EKF2, which other steps reduce"
+    # all fractions add up to 100 %
+    opposite = "; other properties of EKF2 increase it" if share > 1.0 else ""
     return (
-        f"This step changes the position by up to {step.position_moved_m:.2f} m (at "
-        f"{step.moved_at_s:.1f} s) and is {share_text}."
+        f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
+        f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
+        f"{100 * share:.0f} %{opposite}."
     )
 
 
@@ -223,9 +201,9 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""
-    samples = f"{rejection_run.samples} sample{'s' if rejection_run.samples > 1 else ''}"
+    samples = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
     return (
-        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} in a row, and its position "
+        f". From {rejection_run.start_s:.0f} s on EKF2 rejected {samples} in a row; its position "
         f"drifted by {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
     )
 
@@ -252,13 +230,11 @@ def _step_reasons(
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
         delay_text += (
-            f". The maximum-likelihood estimate of the age is {ml_delay_ms:.0f} ms (95 % "
+            f". The maximum-likelihood estimate of this delay is {ml_delay_ms:.0f} ms (95 % "
             f"{low:.0f} to {high:.0f} ms)"
         )
     equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    imu_weight, position_weight = (
-        ("more", "less") if equivalent_sigma_a < settings.sigma_a_m_s2 else ("less", "more")
-    )
+    trusted = "IMU" if equivalent_sigma_a < settings.sigma_a_m_s2 else "positions"
     return {
         steps.SAMPLES: samples_text,
         steps.TIMESTAMPS: delay_text,
@@ -270,7 +246,7 @@ def _step_reasons(
         steps.PROCESS: (
             f"EKF2_ACC_NOISE {flown['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
             f"{equivalent_sigma_a:.2g} m/s²; KF uses {settings.sigma_a_m_s2:.2g} m/s². "
-            f"EKF2 weights the IMU {imu_weight} and the positions {position_weight}"
+            f"EKF2 gives the {trusted} more weight than KF"
         ),
         steps.ATTITUDE: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
@@ -326,6 +302,6 @@ def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
     step_index = int(np.argmin(changes) if ekf2_rmse_m < kf_rmse_m else np.argmax(changes))
     before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [
-        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. The step from KF to EKF2 "
-        f"that changes the RMSE most: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. The replacement that "
+        f"changes the RMSE most: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
     ]

@@ -1,9 +1,7 @@
-"""Estimates of position and acceleration noise, time offset and yaw misalignment of the positions.
+"""Estimates of noises, time offset, yaw misalignment and errors of the position source.
 
-Odometry is smooth over seconds and drifts by metres within minutes. A filter that follows odometry
-has small innovations and a large error, so innovations do not give the measurement noise of
-odometry (``Origin.may_drift``). Scale and heading errors of odometry resemble a changing time
-offset, so :func:`widen_for_drift` widens the 95 % interval of the time offset.
+A source that may drift (odometry) has a smooth but wrong path: innovations are small although the
+position error is large. Its noise estimates do not contain the drift (``Origin.may_drift``).
 """
 
 from collections.abc import Callable, Mapping
@@ -46,10 +44,10 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of estimates of the time offset before and after a tested change in flight
+# Minimum number of time offset estimates on each side of a tested change in flight
 MIN_PARTS = 2
 
-# Axes of the noise estimates in a report; north and east have one estimate
+# Axes with a noise estimate in reports; north and east share one
 REPORTED_AXES = (HORIZONTAL, "down")
 
 Progress = Callable[[str], None]
@@ -68,16 +66,10 @@ class Estimates:
         Time offset between position source and IMU.
     heading : HeadingError or Unavailable
         Yaw misalignment of the position frame.
-    bias_scale_jump_fit : BiasScaleJumpFit or Unavailable
-        Accelerometer biases, scale factor error and position jumps, fitted to innovations.
-    source_low_pass : SourceLowPass or Unavailable
-        Low-pass filter of the position source.
-    time_correlated_noise : TimeCorrelatedNoise or Unavailable
-        Time-correlated noise of the position source, without jumps.
     tuning_by_axis : tuple of AxisTuning
-        Separate noises along north and east if their mean NIS differs; not for GNSS and odometry.
+        Noises along north and along east if they differ; empty for GNSS and odometry.
     noisy_part : NoisyPart or None
-        Time span of the flight with larger innovations; not for odometry.
+        Time span with larger innovations; None for odometry.
     """
 
     tuning: Tuning
@@ -90,22 +82,12 @@ class Estimates:
     noisy_part: NoisyPart | None = None
 
 
-WITHHELD_ESTIMATES = Estimates(
-    tuning={HORIZONTAL: WITHHELD},
-    clock=WITHHELD,
-    heading=WITHHELD,
-    bias_scale_jump_fit=WITHHELD,
-    source_low_pass=WITHHELD,
-    time_correlated_noise=WITHHELD,
-)
-
-
 def ignore_progress(_: str) -> None:
-    """Ignore the name of a step of the computation."""
+    """Ignore the progress text."""
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the noise estimate of the first of several axis names that has an estimate."""
+    """Return the first noise estimate that exists, in the order of the axis names."""
     estimates = map(tuning.get, names)
     return next((each for each in estimates if isinstance(each, AxisTuning)), None)
 
@@ -117,8 +99,6 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and errors of the source."""
-    if comparison.flight.log.is_assessed:
-        return WITHHELD_ESTIMATES
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -151,11 +131,11 @@ def tuned(
     progress : callable
         Called with the name of each estimate before it is computed.
     cache : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
+        IMU motion that several estimates share.
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
     if flight.log.is_assessed:
-        return dict(WITHHELD_ESTIMATES.tuning)
+        return {HORIZONTAL: WITHHELD}
     return tune(
         comparison.lines,
         comparison.settings,
@@ -276,7 +256,7 @@ def _fit_source_errors(
 def _horizontal_axes(
     comparison: Comparison, tuning: Tuning
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
-    """Return the horizontal axes that have a noise estimate, with this estimate."""
+    """Return the horizontal axes that have a noise estimate, and this estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
@@ -291,9 +271,8 @@ def _horizontal_axes(
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
     """Return the reason if the IMU rate is too low to estimate a time offset.
 
-    A sample in a ULog is the mean over its interval. A telemetry message contains only the newest
-    of several samples, minus EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the
-    positions to be tested.
+    A ULog sample is the mean over its interval. Telemetry sends only the newest of several samples,
+    corrected by EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the tested positions.
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
@@ -318,11 +297,10 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
-    """Widen the 95 % interval of a time offset, because the source may drift.
+    """Widen the 95 % interval of the time offset of a source that may drift (odometry).
 
-    Scale errors, heading errors and drift of odometry change the time offset estimates of different
-    flight phases by more than noise, so the scatter of these estimates widens the interval. A
-    change of the time offset in flight needs a significant step of at least ``MIN_CHANGE_S``.
+    Drift makes the estimates of different parts of the flight differ by more than noise, so the
+    interval is widened by their scatter.
     """
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
@@ -335,8 +313,8 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
         reason = (
-            "the time offset estimates of different flight phases differ by more than noise, as "
-            f"with a drifting source: 95 % {low:+.2f} s to {high:+.2f} s"
+            "the time offset differs between parts of the flight, probably because the source "
+            f"drifts (95 % {low:+.2f} s to {high:+.2f} s)"
         )
     return structs.replace(
         clock,
@@ -355,10 +333,10 @@ def _weighted_square_sum(offset: Array, weight: Array) -> float:
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """Return the p-value of the largest change of the time offset in flight, if enough estimates.
+    """Return the p-value of the largest change of the time offset in flight; None if too short.
 
-    Student's t-test of the weighted mean offsets before and after each tested time. The p-value is
-    multiplied by the number of tests (Bonferroni), and 1 for changes below ``MIN_CHANGE_S``.
+    Student's t-test of the mean offsets before and after each time, with Bonferroni correction.
+    Changes below ``MIN_CHANGE_S`` are ignored.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

@@ -24,18 +24,17 @@ class Events:
     Attributes
     ----------
     gaps : tuple of (float, float)
-        Spans without a position measurement, see :func:`source_gaps`.
+        Spans without positions.
     dropouts : tuple of (float, float)
         Spans in which the logger wrote no data.
     ground : tuple of (float, float)
         Spans on the ground, from the land detector.
-    take_off_s, landing_s : tuple of float
     modes : tuple of FlightMode
         Flight modes of PX4; empty if not logged.
     resets_s : tuple of float
-        Times of resets of EKF2's position or velocity.
+        Resets of EKF2's position or velocity.
     rejected_s : mapping from axis name to ndarray
-        Times of measurements that EKF2 rejected.
+        Positions that EKF2 rejected.
     """
 
     gaps: tuple[Span, ...]
@@ -49,20 +48,12 @@ class Events:
 
 
 def max_interval_s(interval_s: float) -> float:
-    """Return the maximum time (s) between two positions without a gap; larger times are gaps."""
+    """Return the interval (s) between positions above which they have a gap."""
     return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Return the time spans (s) without measurements of a source.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Timestamps of the measurements.
-    rate_hz : float
-        Rate of the source between gaps.
-    """
+    """Return the time spans (s) without positions; ``rate_hz`` is the rate between gaps."""
     is_gap = np.diff(time_s) > max_interval_s(1.0 / rate_hz)
     return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 

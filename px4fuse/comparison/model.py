@@ -1,8 +1,8 @@
-"""Records of a comparison, by axis and by filter, with the tracks that were compared."""
+"""Records of a comparison: inputs, results along each axis, and the tracks of both filters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import pandas as pd
 from msgspec import structs
@@ -10,8 +10,10 @@ from msgspec import structs
 from px4fuse.convention.model import Convention
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import (
+    NOT_WRITTEN,
     Count,
     NotNegative,
+    NotWritten,
     OrUnavailable,
     Positive,
     Record,
@@ -28,14 +30,15 @@ from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight.model import Flight, PositionTrack
 
 FilterName = Literal["kf", "ekf2"]
+Track: TypeAlias = pd.DataFrame | Unavailable
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
 class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
     """Errors of one filter against ground truth, at the times of EKF2's published state.
 
-    The mean NEES is of one axis (expected 1), and None without a reported variance or a true
-    velocity. It has no chi-square band, because the errors of one flight are correlated.
+    The mean NEES (expected 1) is None without a reported variance. It has no chi-square band,
+    because the errors of one flight are correlated.
     """
 
     count: Count
@@ -94,10 +97,7 @@ class Difference(Record, frozen=True, kw_only=True):
 
 
 class Updates(Record, frozen=True, kw_only=True):
-    """Number and times of KF's updates along one axis.
-
-    ``input_gap_s`` is the total time (s) without IMU samples.
-    """
+    """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
 
     count: Count
     first_s: float
@@ -106,8 +106,8 @@ class Updates(Record, frozen=True, kw_only=True):
     input_gap_s: NotNegative
 
 
-class AxisResult(Record, frozen=True, kw_only=True):
-    """Result of the comparison along one axis.
+class AxisComparison(Record, frozen=True, kw_only=True):
+    """Result of the comparison along one axis, with the KF run and the tracks.
 
     Attributes
     ----------
@@ -116,12 +116,18 @@ class AxisResult(Record, frozen=True, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        Origin of the axis direction, as text for the user.
-    updates : Updates
-    filters : mapping from "kf" and "ekf2" to FilterSummary or UntestedFilter
-    difference : Difference or Unavailable
+        Origin of the axis direction, for the user.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
+    axis : Axis
+    replay : Replay
+    ekf2_state : DataFrame or Unavailable
+        Position and velocity, without resets that move the origin of EKF2's frame.
+    ekf2_innovations : DataFrame or Unavailable
+        :attr:`Ekf2.innovations` along the axis, with the position variance before (P⁻ = S - R) and
+        after (P⁺ = P⁻R/S) each update.
+    flight_tracks : mapping from attribute name to DataFrame or Unavailable
+        State, variance and ground truth of the whole flight; the attributes contain the segment.
     """
 
     heading_deg: float | None = None
@@ -131,67 +137,38 @@ class AxisResult(Record, frozen=True, kw_only=True):
     filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
     difference: OrUnavailable[Difference]
     rejected_fraction: Share | None = None
-
-
-class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
-    """Result of the comparison along one axis, with the KF run and the tracks.
-
-    Attributes
-    ----------
-    axis : Axis
-    replay : Replay
-    ekf2_state : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment, without resets that move EKF2's frame.
-    ekf2_variance : DataFrame or Unavailable
-        ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
-    ekf2_innovations : DataFrame or Unavailable
-        Columns of :attr:`Ekf2.innovations`, in the segment, with ``prior_variance_m2`` and
-        ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
-    truth : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment.
-    flight_tracks : mapping from "ekf2_state", "ekf2_variance" and "truth" to their values
-        The same tracks, but also in flight before and after the segment.
-    """
-
-    schema_type = AxisResult
-    axis: Axis
-    replay: Replay
-    ekf2_state: pd.DataFrame | Unavailable
-    ekf2_variance: pd.DataFrame | Unavailable
-    ekf2_innovations: pd.DataFrame | Unavailable
-    truth: pd.DataFrame | Unavailable
-    flight_tracks: Mapping[str, pd.DataFrame | Unavailable]
-
-    __repr__ = one_line_repr
+    axis: NotWritten[Axis] = NOT_WRITTEN
+    replay: NotWritten[Replay] = NOT_WRITTEN
+    ekf2_state: NotWritten[Track] = NOT_WRITTEN
+    ekf2_variance: NotWritten[Track] = NOT_WRITTEN
+    ekf2_innovations: NotWritten[Track] = NOT_WRITTEN
+    truth: NotWritten[Track] = NOT_WRITTEN
+    flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
 
     @property
     def in_flight(self) -> "AxisComparison":
-        """Same comparison with the tracks of the whole flight, for plots."""
+        """Same result with the tracks of the whole flight, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Inputs of a comparison and, after the filters ran, their results per axis.
+    """Inputs of a comparison and, after the filters ran, the results along each axis.
 
     Attributes
     ----------
-    flight : Flight
-    source : PositionTrack
-    source_reason : str
-    segment : Segment
     settings : Settings
-        Settings of KF as used: ``input`` is "zero" if the log has no acceleration.
+        Settings of KF; ``input`` is "zero" if the log has no acceleration.
     lines : tuple of Axis
+        Axes with their measurements and accelerations, the inputs of KF.
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
-    missing : tuple of Unavailable
     axes : mapping from axis name to AxisComparison
         Empty before the filters run.
     horizontal : mapping from "kf" and "ekf2" to HorizontalNis
-        NIS of north and east together; empty if north or east was not analysed.
+        NIS of north and east together, if both were analysed.
     convention : Convention or None
-        Axes, unit, clock and orientation of the source as sent; ``source`` is corrected for them.
+        Axes, unit and clock with which the source was sent; ``source`` is already converted.
     """
 
     flight: Flight

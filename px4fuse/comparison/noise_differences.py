@@ -11,16 +11,16 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS along north and east for separate noise estimates, which take time
+# Minimum ratio of the mean NIS along north and east for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of time spans into which a flight is divided to find a noisy one
+# Maximum number of equal time spans of a flight that are searched for a noisy one
 MAX_PARTS = 12
-# Minimum number of measurements in each time span into which a flight is divided
+# Minimum number of measurements in each of these time spans
 MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations; ``ratio`` is their σ relative to the other times."""
+    """Time span (s) with larger innovations; ``ratio``: their σ ÷ σ in the rest of the flight."""
 
     start_s: float
     end_s: float
@@ -48,12 +48,12 @@ def find_noisy_part(
 ) -> NoisyPart | None:
     """Find one time span of the flight in which most innovations are larger.
 
-    ``axis_tuning`` is the noise estimate of both horizontal axes.
+    ``axis_tuning`` is the noise estimate of north and east.
     """
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # without noise estimates (a third of the measurements resemble outliers) use the settings of KF
+    # with many noisy measurements the noises cannot be estimated: use the settings of KF
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)

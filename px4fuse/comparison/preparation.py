@@ -44,8 +44,7 @@ NO_SEPARATE_TRUTH = Unavailable(
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS, without down: GNSS height is much noisier, and all axes have the same
-# SIGMA_Z
+# Default axes for GNSS, without down: one SIGMA_Z does not fit the much noisier GNSS height
 GNSS_AXES = (AISLE, "north", "east")
 
 
@@ -121,10 +120,10 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Select EKF2's innovations of the position source: GNSS or external vision."""
+    """Select EKF2's innovations of the same sensor as the positions: GNSS or external vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # with GNSS, missing innovations of external vision and missing other sources are irrelevant
+    # do not report missing external vision: KF and EKF2 use GNSS in this flight
     missing_vision, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
@@ -142,25 +141,15 @@ def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Choose the position source automatically or by name.
+    """Return the position source and, for the user, the reason for the choice.
 
-    Parameters
-    ----------
-    flight : Flight
-    name : str, optional
-        Name of a position track. Default: the track with the fewest conversions before logging,
-        GNSS only if EKF2 fused it.
-
-    Returns
-    -------
-    track : PositionTrack
-    reason : str
-        Reason for the choice, for the user.
+    Without a ``name``, the source with the fewest conversions before logging is chosen; GNSS only
+    if EKF2 fused it.
 
     Raises
     ------
     MissingDataError
-        The log has no position track, or none of this name.
+        The log has no position source, or none of this name.
     """
     if name is None:
         for track in flight.positions:
@@ -199,9 +188,9 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 
 def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Move vision positions to the origin of GNSS if EKF2 fused GNSS as well.
+    """Shift vision positions to EKF2's origin if EKF2 fused GNSS as well.
 
-    EKF2 then estimates the offset of vision, so an offset is not a fault.
+    EKF2 then estimates the constant offset of vision, so KF must not see it as a position error.
     """
     ekf2 = flight.ekf2
     if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and fused_aid(ekf2)):
@@ -225,7 +214,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Use the barometer height instead of GNSS height, if requested or if EKF2 fused the barometer.
+    """Use the barometer height instead of GNSS height, if requested or if EKF2 did.
 
     A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
@@ -250,7 +239,7 @@ def _use_barometer_height(
         if np.isfinite(ekf2_down_m).any():
             zero_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
         zero_text = "the median of EKF2's height"
-    note = f"the positions along down are barometer heights; zero is {zero_text}"
+    note = f"heights are from the barometer; height 0 is {zero_text}"
     return replace(
         track,
         barometer=heights - zero_m,
@@ -296,11 +285,8 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         and LOGGED_ORIGINS[missing.source].preference < track.origin.preference
     ]
     if not better_sources:
-        return f"most direct position source: as received by PX4{origin_text}"
-    return (
-        f"most direct position source in this log{origin_text}; not usable: "
-        f"{', '.join(better_sources)}"
-    )
+        return f"chosen automatically: positions as received by PX4{origin_text}"
+    return f"chosen automatically{origin_text}; not usable: {', '.join(better_sources)}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -319,12 +305,7 @@ def choose_segment(
 ) -> Segment:
     """Choose the time span to analyse: by default, positions available and vehicle airborne.
 
-    Parameters
-    ----------
-    flight : Flight
-    track : PositionTrack
-    start_s, end_s : float, optional
-        Start and end that the user chose (seconds from the first data); None: automatic.
+    ``start_s`` and ``end_s`` are times that the user chose (seconds from the first data).
 
     Raises
     ------
@@ -348,7 +329,7 @@ def choose_segment(
                 for start, end in flights
                 if start != low
             )
-            reason += f"; longest of {len(flights)} flights, the others are {others}"
+            reason += f"; this is the longest of {len(flights)} flights; the others: {others}"
         if not max(low, first_s) < min(high, last_s):
             low, high = min(low, first_s), max(high, last_s)
             reason = "whole duration of the position source (no positions in flight)"

@@ -25,34 +25,34 @@ from px4fuse.flight.model import (
 EKF2_MIN_NOISE_M = 0.01
 # EKF2's ratio of GNSS height noise to GNSS position noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
-# Minimum number of common samples of filter and ground truth, or of KF and EKF2, for statistics
+# Minimum number of samples that two tracks have in common, for statistics of their difference
 MIN_COMMON_SAMPLES = 3
-# NED columns of each projected quantity, and power of the direction cosines as weights
+# NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Maximum ratio of EKF2's median squared distance to the measurements, without resets to with
-# resets, for resets to be removed
+# Resets are removed if EKF2's median squared distance to the measurements
+# decreases to less than this fraction
 MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
-    """Remove the resets that move the origin of EKF2's frame from its state.
+    """Remove the resets that only move the origin of EKF2's frame.
 
-    Other resets correct an error of EKF2 and remain in its state. Resets move the origin if their
-    removal clearly reduces the median distance of EKF2's position from the measurements.
+    Such resets are found by a smaller median distance to the measurements without them. Other
+    resets correct an error of EKF2 and remain.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Sentence part about removed and other resets; empty without a reset in the segment.
+        Removed and other resets, for the user; empty without a reset.
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
@@ -98,12 +98,11 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, in the frame of each time span between resets."""
+    """Yield EKF2's position without resets, with the origin of each time span between resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # convert to the frame of one time span between resets: add earlier resets, subtract later
-        # ones
+        # keep the origin after this number of resets: add earlier resets, subtract later ones
         shift_m = (~is_after[:, :earlier_count]) @ deltas[:earlier_count] - is_after[
             :, earlier_count:
         ] @ deltas[earlier_count:]
@@ -134,7 +133,7 @@ def _no_samples(what: str) -> Unavailable:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto an axis, without the covariances, which PX4 does not log."""
+    """Project EKF2's variances onto an axis; PX4 logs no covariances between axes."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
@@ -146,14 +145,13 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
 def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
     """Return EKF2's position (m) and variance (m²) at the fusion horizon, if logged.
 
-    The published position does not match the variance: the output predictor propagates it from the
-    fusion horizon to the present, and lags. With external vision, the position before an update is
-    observation minus innovation, and its variance P⁻ = S - R. Before v1.16 the log also contains
-    the state at the fusion horizon. EKF2 logs no covariance between axes, so none is included.
+    The logged variance belongs to this position, not to the published one, which the output
+    predictor extrapolates to the present. EKF2 logs no covariance between axes, so it is neglected.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
+        # state before an update: position = observation - innovation, P⁻ = S - R
         samples = cut_to_segment(aid.samples, segment)
         position, variance = (
             sum(
@@ -168,15 +166,16 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
         return horizon[horizon["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
+    # before PX4 v1.16 the log contains the state at the fusion horizon
     projected = project(ekf2.record.delayed, axis, segment)
     horizon = projected[["position_m", "position_variance_m2"]].dropna()
     return horizon if len(horizon) else None
 
 
 def _altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
-    """Return the altitude (m) to add to logged heights, if they are altitudes, else 0.
+    """Return the altitude (m) of the origin if logged heights are altitudes, else 0.
 
-    Since v1.16 EKF2 fuses altitudes above sea level once it has an origin.
+    Since PX4 v1.16, EKF2 fuses altitudes above sea level once it has an origin.
     """
     published_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
     altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m
@@ -189,8 +188,8 @@ def project_innovations(
 ) -> pd.DataFrame | Unavailable:
     """Project EKF2's innovations onto an axis, with its variance before and after each update.
 
-    Return the columns of :attr:`Ekf2.innovations`, with ``prior_variance_m2`` (P⁻ = S - R) and
-    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected), both NaN if R is unknown.
+    Adds to :attr:`Ekf2.innovations` the columns ``prior_variance_m2`` (P⁻ = S - R) and
+    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected); NaN if R is unknown.
     """
     if track.aid(axis.name) is None:
         return Unavailable(
@@ -228,7 +227,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     common = north.index.intersection(east.index)
     north, east = north.loc[common], east.loc[common]
     cosine, sine = float(direction[0]), float(direction[1])
-    projected = cosine * cosine * north + sine * sine * east  # for variances; other columns follow
+    projected = cosine * cosine * north + sine * sine * east  # correct for variances only
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together: take the larger value
@@ -245,12 +244,9 @@ def observation_variance(
 ) -> float:
     """Return the R (m²) that EKF2 used for the position source; NaN if unknown.
 
-    ``default_noise_m`` replaces EKF2's noise parameter if the parameter is not in the log.
-
-    External vision: R = EKF2_EVP_NOISE², or the sender's variance if larger and EKF2_EV_NOISE_MD
-    is not 1 (EKF2.cpp, ev_pos_control.cpp). GNSS: EKF2_GPS_P_NOISE², for height 1.5 times in σ, or
-    the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp). Barometer:
-    EKF2_BARO_NOISE² (baro_height_control.cpp).
+    R is the square of EKF2's noise parameter, or the reported variance if EKF2 uses it and it is
+    larger. ``default_noise_m`` is used if the log lacks the parameter. Sources: PX4 EKF2.cpp,
+    ev_pos_control.cpp, gps_control.cpp, gnss_height_control.cpp, baro_height_control.cpp.
     """
     aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2
     if aid is not None and isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:

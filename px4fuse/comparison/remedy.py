@@ -16,7 +16,7 @@ from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Values (ms) of EKF2_GPS_DELAY of the re-runs that estimate the delay of GNSS
+# Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message
 TRANSMISSION_MS = 30.0
@@ -25,11 +25,10 @@ DELAY_MAX_STEP_MS = 50.0
 
 
 def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
-    """Estimate the delay of GNSS and its σ (ms), with vision that EKF2 also fuses as reference.
+    """Estimate the delay of GNSS and its σ (ms), if EKF2 fused vision and GNSS velocity.
 
-    The delay minimises the NIS of GNSS position and velocity, summed over re-runs of EKF2 with
-    other values of EKF2_GPS_DELAY. Return None if EKF2 did not fuse vision and GNSS velocity, or if
-    the sum has no minimum.
+    The delay minimises the NIS of GNSS in re-runs of EKF2 with other values of EKF2_GPS_DELAY.
+    Return None if the NIS has no minimum.
     """
     received = model.inputs.received
     if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
@@ -43,7 +42,7 @@ def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for unit, variance_unit in (("m", "m2"), ("m_s", "m2_s2"))
         ]
-        # the number of evaluated samples depends slightly on the delay
+        # mean NIS times a fixed number: the number of evaluated samples depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
     curvature, slope, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     return (-0.5 * slope / curvature, curvature**-0.5) if curvature > 0.0 else None
@@ -57,21 +56,9 @@ def ml_ekf2_parameters(
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of EKF2's noise and delay parameters.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    model : Model
-        EKF2 of the same flight.
-    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
-    clock : ClockOffset or Unavailable
-
-    Returns
-    -------
-    dict
-        Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is included
-        only if the flown value differs significantly, and the noise only if it is outside its 95 %
-        interval. For GNSS and drifting sources the noise is included only if EKF2 uses a smaller
-        one: innovations do not show slow errors.
+    A parameter is included only if it differs significantly from the flown value. A smaller noise
+    is not included for GNSS and odometry, because innovations do not show their slow errors. Empty
+    if EKF2 did not fuse the analysed source.
     """
     if not is_fused_source(comparison, model.inputs):
         return {}
@@ -95,7 +82,6 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """Return the estimated delay parameter of EKF2, if it differs significantly."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     ml_delay_ms = wrong_delay_ms(comparison, clock, inputs.settings[inputs.aid.delay])
@@ -137,7 +123,7 @@ def delay_ms(comparison: Comparison) -> float | None:
 
 
 def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str, float]:
-    """Return EKF2's parameters for ``noise_m`` if the estimate excludes the flown noise."""
+    """Return EKF2's parameters for ``noise_m`` if the flown noise is outside the 95 % interval."""
     if (estimate.low or 0.0) <= noise_used_m(inputs) <= (estimate.high or math.inf):
         return {}
     return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
@@ -146,10 +132,9 @@ def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str
 def noise_change(
     aid: Aid, settings: Mapping[str, float], reported_m: float, noise_m: float
 ) -> dict[str, float]:
-    """Return the EKF2 parameters for a position noise ``noise_m``.
+    """Return the EKF2 parameters that set the position noise to ``noise_m``.
 
-    ``settings`` are the parameters as flown; ``reported_m`` is the noise (σ) that the sender
-    reports, which EKF2_EVP_NOISE does not reduce.
+    If the sender reports a larger noise (``reported_m``), EKF2 must also ignore the reported one.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_m:
@@ -158,9 +143,9 @@ def noise_change(
 
 
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a position delay ``delay_ms``; early timestamps give 0.
+    """Return the EKF2 parameters for a position delay; a negative delay is set to 0.
 
-    Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source.
+    Empty if the delay exceeds PX4's maximum, or if EKF2 ignores the delay parameter.
     """
     delay = inputs.aid.delay
     parameter = PARAMETERS[delay]
@@ -172,7 +157,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
-    """Return the EKF2_DELAY_MAX (from PX4 v1.14) for positions of this age, if it is too short."""
+    """Return a larger EKF2_DELAY_MAX (PX4 v1.14 and later) if positions of this age need it."""
     needed_ms = age_ms + TRANSMISSION_MS
     if needed_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}

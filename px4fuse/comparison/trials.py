@@ -1,4 +1,4 @@
-"""Re-runs of a filter along one axis with a change, and the statistics that a re-run improves."""
+"""Re-runs of a filter along one axis with a change, and the statistics that they improve."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,53 +12,39 @@ from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics of a filter that re-runs try to bring inside their limits
+# Statistics of an inconsistent filter that re-runs try to correct
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
 # Keys of Trial.change that are not EKF2 parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum mean NEES for a position error larger than the reported σ (2 σ): without a fault it is
-# below 3
+# Minimum mean NEES (error of 2 reported σ) that is reported: flights without a fault stay below 3
 MIN_NEES_FINDING = 4.0
-# Maximum mean NEES of a re-run with a smaller noise, if the mean NEES as flown is above 1
+# Maximum mean NEES after a reduction of a noise, if the filter was already overconfident
 MAX_NEES_AFTER_CHANGE = 2.0
-# Maximum distance of explained_fraction from 1 for a cause, which explains at least half
-MAX_CAUSE_DISTANCE = 0.5
-# Maximum distance of explained_fraction from 1 for a sensor fault that is the only cause: the
-# noises of the re-run are approximate
+# A cause has an explained_fraction of 1 ± this tolerance
+CAUSE_TOLERANCE = 0.5
+# A corrected sensor fault is a sufficient cause if its explained_fraction is 1 ± this tolerance
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Maximum distance of explained_fraction from 1 for a change to be combined with another one
-MAX_HELPFUL_DISTANCE = 0.9
-# Keys of changes that correct a sensor fault, which are preferred to changes of settings
+# Two changes are combined if each has an explained_fraction of 1 ± this tolerance
+HELPFUL_TOLERANCE = 0.9
+# Keys of changes that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# Keys of changes that another change requires, so find_cause does not count them
+# Keys that are not counted as a separate change, because another change requires them
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
-# Minimum factor by which a re-run with an effect changes a σ ratio
+# Smaller changes of a σ ratio by a re-run (as a factor) are negligible
 MIN_RATIO_CHANGE = 1.10
-# Minimum relative change of the position RMSE by a re-run with an effect
+# Smaller relative changes of the position RMSE by a re-run are negligible
 MIN_RMSE_CHANGE = 0.05
-# Minimum relative reduction of the position RMSE by a re-run that improves the position
+# Minimum relative reduction of the position RMSE that is an improvement
 POSITION_IMPROVEMENT = 0.20
-# Maximum ratio of ln(error ÷ σ), with the change to as flown, for a change that corrects the error
+# Maximum fraction of ln(error ÷ σ) that remains after a change that corrects the error
 MAX_ERROR_LEFT = 0.75
 
 
 class RunStatistics(Record, frozen=True, kw_only=True):
-    """Statistics of one run of a filter along one axis.
-
-    Attributes
-    ----------
-    innovations : int
-    nis_mean : float or None
-    position_rmse_m, nees_mean : float or None
-        Statistics against ground truth, at the times of EKF2's published state.
-    difference_rms_m : float or None
-        RMS position difference KF - EKF2.
-    rejected_fraction : float or None
-        Fraction of positions that EKF2 rejected; None for KF, which has no gate.
-    """
+    """Statistics of one run of a filter along one axis; RMSE and NEES are against ground truth."""
 
     innovations: Count = 0
     nis_mean: Positive | None = None
@@ -80,23 +66,17 @@ class Trial(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    filter : {"kf", "ekf2"}
-    axis : str
     kinds : tuple of str
-        Kind of each change: for KF noises, defaults or bias, for EKF2 delay, noise, gate or process
-        noise, for both outliers, time offset or rotation.
+        Kinds of change, for example "noise", "delay", "outliers" or "rotation".
     change : mapping from name to value
-        Fields of Settings, PX4 parameters, ``turned_deg`` (rotation of the positions, clockwise
-        from above), ``outliers_left_out`` (number), and the removed accelerometer biases
-        ``bias_forward_m_s2`` and ``bias_right_m_s2``.
+        KF settings, EKF2 parameters, or a correction of the data: ``turned_deg`` (clockwise
+        rotation of the positions), ``outliers_left_out`` (number), or a removed accelerometer bias.
     discrepancies : tuple of {"nis", "nees"}
-        Statistics as flown that are outside their limits and that the change may explain.
-    before : RunStatistics
-        Statistics as flown, over the same samples as ``after``.
+        Statistics outside their limits that the change may correct.
+    before, after : RunStatistics
+        Statistics as flown and with the change, over the same samples.
     is_logged : bool
-        False if ``before`` is from a replay of EKF2, because the replay differs from the log.
-    after : RunStatistics
-        Statistics with the change; for EKF2 from its replay.
+        False if ``before`` is from a replay of EKF2 instead of the log.
     from_s : float or None
         Start of the evaluated time; None for the whole segment.
     """
@@ -113,15 +93,15 @@ class Trial(Record, frozen=True, kw_only=True):
 
     @property
     def corrects_sensor(self) -> bool:
-        """True if the change corrects a fault of a sensor, not a setting of a filter."""
+        """True if the change corrects a sensor fault instead of a setting."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
 
 def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    Above 1 the change overshoots. For the statistic "difference", return the fraction of the mean
-    square difference KF - EKF2 that the change removes. Return 0 if a value is missing or zero.
+    For "difference": the removed fraction of the mean square difference KF - EKF2. Above 1 the
+    change is too large; 0 if unknown.
     """
     before, after = trial.before.value(statistic), trial.after.value(statistic)
     if not before or not after:
@@ -129,6 +109,10 @@ def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     if statistic == "difference":
         return 1.0 - (after / before) ** 2
     return 1.0 - float(np.log(after) / np.log(before))
+
+
+def _distance(trial: Trial, statistic: Statistic) -> float:
+    return abs(explained_fraction(trial, statistic) - 1.0)
 
 
 def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
@@ -148,7 +132,7 @@ def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return the re-runs of a filter along an axis whose change may explain a discrepancy."""
+    """Return the re-runs of a filter along an axis that may correct a statistic."""
     return [
         trial
         for trial in trials
@@ -159,15 +143,13 @@ def find_trials(
 def find_cause(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Trial | None:
-    """Return the re-run whose change best explains a mean NIS or mean NEES outside its limits.
+    """Return the re-run that best corrects a mean NIS or mean NEES outside its limits.
 
-    A cause has an :func:`explained_fraction` of 50 to 150 % and does not contradict ground truth.
-    Preferred are, in this order, sufficient causes, fewer changes, sensor faults, and fractions
-    near 1.
+    Single changes are preferred to pairs, and corrected sensor faults to settings.
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        distance = abs(explained_fraction(trial, statistic) - 1.0)
+        distance = _distance(trial, statistic)
         is_complete = trial.corrects_sensor and distance <= SENSOR_CAUSE_TOLERANCE
         return (
             not (is_complete or is_sufficient(trial, statistic)),
@@ -179,29 +161,20 @@ def find_cause(
     causes = (
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
-        if abs(explained_fraction(trial, statistic) - 1.0) <= MAX_CAUSE_DISTANCE
+        if _distance(trial, statistic) <= CAUSE_TOLERANCE
         and not contradicts_truth(trial, statistic)
     )
     return min(causes, key=rank, default=None)
 
 
 def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs whose change explains a fraction of a discrepancy, best first.
-
-    The list is empty if one of the changes is sufficient.
-    """
-
-    def distance(trial: Trial) -> float:
-        return abs(explained_fraction(trial, statistic) - 1.0)
-
-    helpful = sorted(
-        (
-            trial
-            for trial in trials
-            if statistic in trial.discrepancies and distance(trial) < MAX_HELPFUL_DISTANCE
-        ),
-        key=distance,
-    )
+    """Return the re-runs that correct a statistic partly, best first; empty if one suffices."""
+    helpful = [
+        trial
+        for trial in trials
+        if statistic in trial.discrepancies and _distance(trial, statistic) < HELPFUL_TOLERANCE
+    ]
+    helpful.sort(key=lambda trial: _distance(trial, statistic))
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
@@ -212,7 +185,7 @@ def distance_from_one(outcome: RunStatistics) -> float:
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
-    """Return a sort key for re-runs of one kind of change: the best re-run has the smallest key."""
+    """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
     enters = enters_band(trial)
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
@@ -255,7 +228,7 @@ def halves(trial: Trial) -> bool:
 
 
 def leaves_error(trial: Trial) -> bool:
-    """Return True if a filter remains nearly as overconfident against ground truth as flown."""
+    """Return True if the filter remains nearly as overconfident against ground truth as before."""
     return any(
         name == "truth"
         and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
@@ -267,16 +240,9 @@ def leaves_error(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], owner: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the best re-run of one filter with one kind of change, if it improves anything.
+    """Return the best re-run of one filter with one kind of change that improves something.
 
-    Parameters
-    ----------
-    trials : iterable of Trial
-    owner : {"kf", "ekf2"}
-    kind : str
-        See :attr:`Trial.kinds`.
-    name : str
-        Setting or EKF2 parameter that the change contains; an empty text allows any.
+    ``name`` limits the search to changes of one setting or EKF2 parameter.
     """
     return min(
         (
@@ -304,9 +270,9 @@ def has_effect(trial: Trial) -> bool:
 
 
 def can_improve(trial: Trial) -> bool:
-    """Return True if a re-run is able to show an improvement.
+    """Return True if a re-run could show an improvement.
 
-    This needs ground truth, or a σ ratio that is inconsistent without the change.
+    This requires ground truth or a σ ratio that is inconsistent as flown.
     """
     return trial.before.position_rmse_m is not None or any(
         classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
@@ -316,8 +282,8 @@ def can_improve(trial: Trial) -> bool:
 def improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    Position: the RMSE is lower by 20 %. σ: a σ ratio (against source or ground truth) becomes
-    consistent or its |ln| halves, and the other one does not get worse.
+    The position RMSE must decrease by 20 %. A σ ratio must become consistent, or its |ln| must
+    halve, without making the other one worse.
     """
     before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(

@@ -1,16 +1,12 @@
-"""Maximum-likelihood search for the convention of positions: axes, unit, rotation and delay.
+"""Search for the axes, unit, rotation and delay of positions that agree with the IMU.
 
-A hypothesis maps the positions to north, east and down. It consists of axes (48 signed
-permutations, mirrored ones included), a rotation about the vertical, a length unit and a time
-offset (usually up to 10 s). For one time offset, all hypotheses are scored from one 3×3 matrix of
-moments: with w = D_a ± i D_b of the source and n = A_north + i A_east of the IMU, the best rotation
-is the angle of Σ conj(w) n. The best hypotheses are refined together with an accelerometer bias in
-the body frame and, with the heading integrated from the gyroscopes, its linear drift.
+1. Grid search: compare each combination of axes (also left-handed ones), unit and time offset with
+   the motion from the IMU. The best rotation about the vertical has a closed form.
+2. Least squares: refine the best hypotheses, together with an accelerometer bias and, if the
+   heading is integrated from the gyroscopes, its drift.
 
-Residuals (m) have a Student distribution with ``FREEDOM`` degrees of freedom, with one scale for
-north and east and one for down. The log likelihood is relative to positions that are unrelated to
-the motion measured by the IMU. It contains the Jacobian of the unit, because small units make
-residuals small.
+Residuals (m) have a Student distribution. The log likelihood is relative to positions that are
+unrelated to the motion.
 """
 
 from collections.abc import Mapping
@@ -36,9 +32,9 @@ MIN_SIGMA_DOWN_M = 0.08
 FREEDOM = 4.0
 # Size of each length unit in metres
 UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Maximum rotation (rad) of the frame about the vertical that is not a different convention
+# Rotations (rad) of the frame about the vertical below this limit are misalignments
 SMALL_ROTATION = np.radians(8.0)
-# Maximum time offset (s) that does not lower the prior odds of a hypothesis
+# Larger time offsets (s) lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION
 ROTATION_ODDS = -1.0
@@ -48,11 +44,11 @@ OFFSET_ODDS = -2.0
 UNIT_ODDS = -2.0
 # Standard deviation (m) of barometer heights in the likelihood
 BAROMETER_SIGMA_M = 0.5
-# Number of independent barometer heights that the likelihood assumes
+# Assumed number of independent barometer heights
 BAROMETER_WEIGHT = 6.0
-# Maximum number of hypotheses from the search on a grid that are refined
+# Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED = 8
-# Maximum log likelihood ratio of the best hypothesis to another hypothesis, to refine the other one
+# Hypotheses whose log likelihood is lower than the best one by more than this are not refined
 MAX_DEFICIT = 60.0
 # Maximum number of second differences used to refine a hypothesis
 MAX_ROWS = 1200
@@ -65,22 +61,28 @@ MAX_STEP_S = 0.15
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of the directions of x, y, z. Left-handed ones: a wrong sign, or x and y exchanged
+# Log prior odds of common directions of x, y, z
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
-    ("north", "east", "up"): -2.5,
-    ("east", "north", "down"): -2.5,
+    ("north", "east", "up"): -2.5,  # a sign is wrong
+    ("east", "north", "down"): -2.5,  # x and y are exchanged
     ("north", "west", "down"): -2.5,
 }
 
 
 class Family(NamedTuple):
-    """Assignment of the axes x, y, z: indices of the vertical axis and of both horizontal axes.
+    """Assignment of x, y, z to a vertical axis and two horizontal axes, before the rotation.
 
-    ``sign`` is 1 if the vertical axis points down. ``hand`` is 1 if the horizontal axis ``b`` is
-    clockwise from the horizontal axis ``a``.
+    Attributes
+    ----------
+    vertical, a, b : int
+        Indices (0: x, 1: y, 2: z) of the vertical axis and of the horizontal axes.
+    sign : {1, -1}
+        1 if the vertical axis points down.
+    hand : {1, -1}
+        1 if axis ``b`` is 90° clockwise from axis ``a``.
     """
 
     vertical: int
@@ -91,11 +93,10 @@ class Family(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
-        """True for a left-handed frame."""
         return (self.sign * self.hand < 0) != (self.vertical == 1)
 
     def axes(self, quarter: int) -> Axes:
-        """Return the directions of x, y, z if the axis ``a`` points to ``CLOCKWISE[quarter]``."""
+        """Return the directions of x, y, z with axis ``a`` at ``quarter`` · 90° from north."""
         names: list[Direction] = ["down" if self.sign > 0 else "up"] * 3
         names[self.a] = CLOCKWISE[quarter % 4]
         names[self.b] = CLOCKWISE[(quarter + self.hand) % 4]
@@ -115,7 +116,7 @@ FAMILIES = tuple(
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions of a source as sent, and barometer data as (time in s, height in m)."""
+    """Positions of a source as sent, and barometer times (s) and heights (m)."""
 
     time_s: Array
     position_m: Array
@@ -123,11 +124,10 @@ class Positions:
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "Positions":
-        """Return the positions with timestamps corrected for a clock drift (rate minus 1)."""
         return replace(self, time_s=without_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
-        """Return the second differences of the positions for all tested time offsets."""
+        """Return the second differences of the positions at a constant interval."""
         edge = round(self.max_offset_s / GRID_S)
         grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
         return SourceMotion.of(self.time_s, self.position_m, grid)
@@ -139,25 +139,19 @@ class Hypothesis:
 
     Attributes
     ----------
-    family : Family
-    unit : str
     parameters : ndarray, shape (7,)
-        Delay of the timestamps (s); rotation of axis ``a`` from north, clockwise (rad); drift of
-        the gyroscopes' heading (rad/s); clock drift; accelerometer bias (m/s²; forward, right,
-        down).
+        Delay of the timestamps (s), rotation of axis ``a`` clockwise from north (rad), heading
+        drift of the gyroscopes (rad/s), clock drift, accelerometer bias in FRD (m/s²).
     score : float
-        Log likelihood relative to positions unrelated to the IMU, plus log prior odds.
+        Log likelihood plus log prior odds.
     has_rotation : bool
-        True to estimate the rotation, False to keep it at a multiple of 90°.
-    has_clock_drift : bool
+        False if the rotation is fixed to a multiple of 90°.
     scale, max_scale : float
-        Ratio of distances in the source, converted to metres, to those of the IMU: lower limit (if
-        only the IMU has noise) and upper limit (if only the source has noise).
+        Bounds of the ratio of the source's distances to those of the IMU.
     sigma_m : float
         Scale (m) of the horizontal residuals.
     windows : float
         Number of independent residuals.
-    heading_from : {"EKF2", "gyroscopes"}
     """
 
     family: Family
@@ -179,21 +173,20 @@ class Hypothesis:
 
     @property
     def quarter(self) -> int:
-        """Number of quarter turns nearest to the rotation from north."""
+        """Rotation from north, in quarter turns (rounded)."""
         return round(float(self.parameters[1]) / (np.pi / 2.0))
 
     @property
     def axes(self) -> Axes:
-        """Directions of x, y and z to the nearest quarter turn, for example north, east, down."""
+        """Directions of x, y, z, to the nearest quarter turn."""
         return self.family.axes(self.quarter)
 
     @property
     def remainder_rad(self) -> float:
-        """Rotation (rad) in addition to the quarter turns."""
+        """Rotation (rad) minus the quarter turns."""
         return float(self.parameters[1] - self.quarter * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
-        """Return True if another hypothesis has similar axes, unit, rotation and time offset."""
         turn_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
         is_similar = abs(self.offset_s - other.offset_s) < 0.5 and abs(turn_rad) < max_turn_rad
         return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
@@ -208,7 +201,7 @@ def without_drift(time_s: Array, drift: float) -> Array:
 def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
     """Return all likely conventions of the positions, best first.
 
-    The list is empty without enough motion, or enough time with positions and IMU data.
+    Empty without motion, or if positions and IMU data overlap for less than ``MIN_OVERLAP_S``.
     """
     refined = []
     for heading_from, imu in motions.items():
@@ -228,9 +221,9 @@ def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> 
 
 
 def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
-    """Search for likely conventions on a grid of time offsets.
+    """Find likely conventions on a grid of time offsets.
 
-    For each unit, assignment of axes and quarter turn, only the best time offset is considered.
+    For each unit, axes and quarter turn, only the best time offset is kept.
     """
     left = np.column_stack([source.table, source.table**2, source.is_valid])
     right = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
@@ -290,7 +283,7 @@ def refine(
 def _evaluate(
     hypothesis: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
 ) -> tuple[Hypothesis, Array]:
-    """Return a hypothesis with its log likelihood, and the Gauss-Newton step of its parameters."""
+    """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
     offset_s, angle, heading_drift, clock_drift = hypothesis.parameters[:4]
     bias, time_s = hypothesis.parameters[4:], source.time_s[rows]
     row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
@@ -366,7 +359,7 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 
 def _log_odds(hypothesis: Hypothesis, positions: Positions) -> float:
-    """Return the log prior odds of a hypothesis, plus its log likelihood of barometer heights."""
+    """Return the log prior odds of a hypothesis, plus the log likelihood of its heights."""
     odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
     odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:

@@ -36,27 +36,27 @@ from px4fuse.trajectory.rotation import heading
 
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
-# Minimum log likelihood ratio to positions unrelated to the motion for any decision
+# Minimum log likelihood of a convention, relative to positions unrelated to the motion
 MIN_GAIN = 8.0
-# Minimum log likelihood ratio per independent sample: unambiguous and ambiguous convention
+# Minimum log likelihood per independent sample: of an unambiguous, and of an ambiguous convention
 MIN_GAIN_PER_WINDOW = (0.15, 0.4)
-# Range of the ratio of distances of the source to those of the IMU, else the result is doubtful
+# The result is doubtful if the source's distances ÷ those of the IMU are outside this range
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# Maximum ratio of residuals to source noise and IMU error, else the result is doubtful
+# The result is doubtful if the residuals exceed the noise of source and IMU by this factor
 MAX_RESIDUAL_RATIO = 2.4
 # Position error (m) of the second differences of the IMU
 IMU_ERROR_M = 0.05
-# Maximum log likelihood ratio of the gyroscopes' heading to the logged heading, to use the logged
-# one
+# The logged heading is preferred to that of the gyroscopes if its log likelihood is lower by less
+# than this: it is relative to north
 MAX_LOGGED_DEFICIT = 20.0
-# Minimum gain of the log likelihood by a clock drift, to correct the drift
+# A clock drift is corrected if it increases the log likelihood by more than this
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Maximum fraction of repeated positions for the check to ignore them
-MAX_REPEATED_SHARE = 0.5
-# Minimum fraction of positions with a height for the check to use heights
-MIN_HEIGHT_SHARE = 0.5
+# Repeated positions are ignored if their fraction is below this limit
+MAX_REPEATED_FRACTION = 0.5
+# Heights are used if at least this fraction of the positions has one
+MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE = 20.0
 # Variance of second differences of white noise with variance 1
@@ -107,11 +107,11 @@ def check_convention(
 def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
     """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MIN_HEIGHT_SHARE:
+    if samples["down_m"].notna().mean() < MIN_HEIGHT_FRACTION:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
-    if is_repeated.mean() < MAX_REPEATED_SHARE:
+    if is_repeated.mean() < MAX_REPEATED_FRACTION:
         samples = samples[~is_repeated]
     heights = None
     if barometer is not None:
@@ -120,10 +120,7 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
 
 
 def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
-    """Return the likely conventions with logged heading and with gyroscope heading, best first.
-
-    The logged heading refers to north, so it is preferred if it fits nearly as well.
-    """
+    """Return the likely conventions, best first; the logged heading is preferred."""
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
         if (
@@ -137,7 +134,7 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
 
 
 def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) -> Convention:
-    """Decide whether the best convention is unambiguous, and its residuals explained by noise."""
+    """Decide whether the best convention is unambiguous and its residuals are plausible."""
     best = hypotheses[0]
     rivals = [hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best)]
     if not positions.position_m[:, 2].any():  # without heights, up and down fit equally well
@@ -191,7 +188,8 @@ def _describe(hypothesis: Hypothesis) -> str:
 def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
     """Return the ratio of the residuals to the noise of source and IMU.
 
-    The noise of the source is estimated from third differences, which contain hardly any motion.
+    The noise of the source is from third differences of the positions, which contain hardly any
+    motion.
     """
     third = np.diff(positions.position_m, 3, axis=0)
     deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
@@ -200,7 +198,7 @@ def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
 
 
 def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
-    """Return the most likely drift of the source's clock, or 0 if it is not significant."""
+    """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
     start = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
@@ -223,7 +221,7 @@ def _check_orientation(
     best: Hypothesis,
     verdict: Verdict,
 ) -> OrientationConvention | None:
-    """Check the convention of the source's orientation, and its heading against the positions."""
+    """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     checked = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
@@ -237,7 +235,7 @@ def _check_orientation(
     motion = motion_from_imu(inertial, replace_heading(inertial.gyro, own_heading))
     is_covered = (motion.time_s > time_s[0] + WINDOW_S) & (motion.time_s < time_s[-1] - WINDOW_S)
     motion = replace(motion, is_valid=motion.is_valid & is_covered)
-    # heading (°) of the x axis of a position frame that agrees with the orientation's frame
+    # correct headings (°) of the x axis of the positions, given the frame of the orientation
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
     if best.family.sign > 0:
         directions_deg = [0.0]

@@ -1,4 +1,4 @@
-"""Faults in the convention of a position source, and their correction in flight and source."""
+"""Faults in the convention of a position source, and the conversion to PX4's convention."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -16,14 +16,13 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) of a frame with wrong axes to be corrected here: HeadingError contains
-# smaller rotations
+# Smaller rotations (°) of a frame with wrong axes are not converted, but reported as heading error
 MIN_REMAINDER_DEG = 8.0
-# Minimum rotation (°) to be corrected here, of a frame with right axes
+# Smaller rotations (°) of a frame with right axes are not converted, but reported as heading error
 MIN_ROTATION_DEG = 15.0
-# Minimum time offset (s) to be corrected here: ClockOffset contains smaller offsets
+# Smaller time offsets (s) are not corrected, but reported as clock offset
 MIN_LATE_S = 0.5
-# Minimum heading error (°) of a source's orientation relative to its positions, for a fault
+# Minimum heading error (°) of a wrong orientation, relative to the motion of the same source
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
@@ -31,25 +30,24 @@ OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults in the convention of a position source, compared with PX4's convention.
+    """Deviations of a position source from PX4's convention.
 
     Attributes
     ----------
     axes : bool
         True if the axes are not NED, even after a rotation about the vertical.
     rotation_deg : float
-        Clockwise rotation of the positions relative to NED; relative to ENU or NWU for such axes.
-    unit : bool
-    late_s, clock_drift : float
-        Delay of the timestamps, and rate of the source's clock minus 1; 0 if not significant.
-    orientation : str
-        Fault of the orientation; empty without a fault.
+        Clockwise rotation of the positions from NED, or from ENU or NWU if these are their axes.
+    late_s : float
+        Delay of the timestamps.
+    clock_drift : float
+        Rate of the source's clock minus 1.
     affects_ekf2 : bool
-        True if EKF2 fused the faulty source, so that EKF2's attitude is wrong, too.
+        True if EKF2 fused the source, so EKF2's attitude is wrong too.
     is_north_unknown : bool
-        True if EKF2's heading is from the source, so that the rotation from north is unknown.
+        True if EKF2's heading is from the source.
     is_ambiguous : bool
-        True if several conventions fit equally well, and NED in metres is not one of them.
+        True if several conventions fit, but not NED in metres.
     """
 
     axes: bool = False
@@ -88,7 +86,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
-    # if EKF2's heading is from the source's orientation, positions have no reference to north
+    # EKF2 fused the yaw of the source, so nothing in the log shows north
     has_own_heading = (
         is_fused and is_drifting and convention.orientation is not None and fault != "copied"
     )
@@ -108,7 +106,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
-    """Return True for axes other than NED, and the clockwise rotation (°) of the positions."""
+    """Return (True if the axes are not NED, clockwise rotation of the positions in °)."""
     rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
     is_known = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known or convention.z not in ("up", "down"):
@@ -136,16 +134,15 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
 def correct(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
-    """Convert positions and orientation of a position source to the convention of PX4.
+    """Convert a position source to PX4's convention.
 
-    If EKF2 fused the faulty source, the attitude integrated from the gyroscopes replaces EKF2's
-    attitude, which is faulty, too.
+    If EKF2 fused the wrong positions, its attitude is replaced by that of the gyroscopes.
     """
     faults = find_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
-    to_ned = _matrix(convention, faults)
+    to_ned = _matrix_to_ned_metres(convention, faults)
     position = samples[Columns.POSITION].to_numpy() @ to_ned.T
     variance = samples[Columns.POSITION_VARIANCE].to_numpy()
     is_unknown = np.isnan(variance).all(axis=1, keepdims=True)
@@ -168,7 +165,7 @@ def correct(
     if inertial is None:
         return flight, track
     attitude = inertial.attitudes[convention.heading_from]
-    # take north from the positions
+    # the axes of the positions are right: rotate the attitude to the same north
     if not faults.axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
@@ -176,8 +173,7 @@ def correct(
     return replace(flight, attitude=table), track
 
 
-def _matrix(convention: Convention, faults: Faults) -> Array:
-    """Return the 3×3 matrix that converts the positions to NED in metres."""
+def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     scale = UNITS[convention.unit]
     if not faults.axes and not faults.rotation_deg:
         return scale * np.eye(3)

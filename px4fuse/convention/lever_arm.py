@@ -20,17 +20,19 @@ from px4fuse.trajectory.scores import autocorrelation_time
 MIN_ARM_M = 0.2
 # Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
 MIN_ARM_SIGMAS = 2.5
-# Minimum lever arm (m) and minimum lever arm in σ for a finding from ground truth
-MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS = 0.05, 5.0
+# Minimum lever arm (m) for a finding, estimated with ground truth
+MIN_TRUE_ARM_M = 0.05
+# Minimum lever arm in σ for a finding, estimated with ground truth
+MIN_TRUE_ARM_SIGMAS = 5.0
 # Maximum lever arm (m) for a finding: a larger one is an error of the frame
 MAX_ARM_M = 5.0
-# Maximum residual, in σ, of a sample that the next fit uses
+# Samples with a larger residual (σ) are excluded from the next fit
 CLIPPED_SIGMAS = 3.0
 # Minimum ratio of the singular values of a fit with ground truth
 MIN_SINGULAR_RATIO = 0.02
 # Minimum number of measured coordinates for a fit with ground truth
 MIN_ROWS = 40
-# Number of successive least squares fits, each without the outliers of the previous fit
+# Number of fits; each excludes the outliers of the previous one
 ITERATIONS = 4
 
 
@@ -47,7 +49,7 @@ class LeverArm(NamedTuple):
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm that EKF2's parameters do not contain, from ground truth if logged."""
+    """Estimate the lever arm that EKF2's parameters lack, from ground truth if logged."""
     arm = None
     if isinstance(flight.truth, Truth):
         arm = _fit_to_truth(flight, flight.truth, track)
@@ -55,7 +57,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
 
 
 def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
-    """Fit the errors of the positions against ground truth with a constant and a lever arm."""
+    """Fit a constant, a lever arm and a delay to the position errors against ground truth."""
     attitude, columns = flight.attitude, Columns.POSITION[:2]
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     samples = track.samples[columns].dropna()
@@ -66,7 +68,7 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     time_s, known = samples.index.to_numpy(), truth.samples
     true_m = [np.interp(time_s, known.index, known[name], np.nan, np.nan) for name in columns]
     error_m = samples.to_numpy() - np.transpose(true_m)
-    # late timestamps of a vehicle that flies forward resemble a lever arm
+    # a delay is estimated too (error = velocity · delay), because it resembles a lever arm
     velocity_m_s = np.gradient(np.transpose(true_m), time_s, axis=0)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]

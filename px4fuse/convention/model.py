@@ -19,17 +19,15 @@ class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=Fal
     Attributes
     ----------
     verdict : str
-        "determined" or "ambiguous"; "copied": equal to the autopilot's attitude; "unrelated": no
-        convention relates the orientation to the attitude.
+        "copied": equal to EKF2's attitude; "unrelated": no convention fits the attitude.
     order : {"w x y z", "x y z w"}
-        Order of the components as sent.
+        Order of the quaternion's components as sent.
     frames : str
         Body frame and world frame of the orientation.
     heading_error_deg : float or None
-        Heading of the orientation relative to the positions, clockwise from above; None if it
-        cannot be determined.
+        Heading of the orientation relative to the positions, clockwise from above.
     tilt_difference_deg : float
-        Median tilt difference from the gyroscopes' attitude, after conversion to FRD and NED.
+        Median tilt difference from the gyroscopes' attitude.
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
@@ -45,31 +43,21 @@ class Convention(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     verdict : str
-        "determined", "ambiguous", "not determinable", or "doubtful": the residuals of the best
-        hypothesis exceed the noise of source and IMU.
-    x, y, z : str
-        Directions of the axes as sent, to the nearest quarter turn about the vertical.
-    unit : {"m", "cm", "mm", "feet"}
-    is_mirrored : bool
-        True for a left-handed frame.
+        "doubtful": the best convention leaves residuals larger than the noise.
     rotation_deg : float
-        Further rotation of the positions from these axes, clockwise from above; 0 if not
-        significant.
+        Rotation of the positions relative to the axes x, y, z, clockwise from above.
     heading_from : {"EKF2", "gyroscopes"}
-        Heading that fits the positions: logged by EKF2, or integrated from the gyroscopes.
+        Attitude that fits the positions: logged by EKF2, or integrated from the gyroscopes.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Distances of the source relative to those of the IMU, with the unit applied.
+        Distances of the source relative to those of the IMU.
     log_odds : float or None
-        Log likelihood ratio (with priors) to the second best convention; None without it.
+        Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float
-        Log likelihood ratio to positions without relation to the motion.
-    alternatives : tuple of str
-        Other conventions that fit nearly as well, as texts.
-    orientation : OrientationConvention or None
+        Log likelihood ratio to positions that are unrelated to the motion.
     """
 
     verdict: Verdict

@@ -1,12 +1,11 @@
 """Second differences of the position, from the IMU and from a position source.
 
-The second difference of a position is a double integral of the acceleration a(t), without unknown
-initial position and velocity:
+A second difference is a double integral of the acceleration a(t), without the unknown initial
+position and velocity:
 
 p(t + T) - 2 p(t) + p(t - T) = ∫ (T - |s|) a(t + s) ds, s from -T to T
 
-The running mean over ``HIGH_PASS_S`` is subtracted, which removes constant errors of the
-acceleration (tilt, bias).
+Subtracting its running mean removes constant acceleration errors (tilt, bias).
 """
 
 from dataclasses import dataclass
@@ -42,12 +41,11 @@ GRID_S = 0.1
 STEP_S = 0.02
 # Length (s) of the running mean that is subtracted from the second differences
 HIGH_PASS_S = 12.0
-# Length (s) of the running mean of the specific force that defines the vertical. The mean is
-# centred, so it causes no delay
+# Length (s) of the centred running mean of the specific force that defines the vertical
 LEVELLING_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-# Minimum interval (s) between two positions that counts as a gap
+# Minimum interval (s) between two positions that is a gap
 MIN_GAP_S = 0.35
 
 
@@ -60,9 +58,10 @@ class Inertial:
     time_s : ndarray, shape (n + 1,)
     force_m_s2 : ndarray, shape (n, 3)
         Mean specific force in the body frame (FRD) between successive times.
-    logged, gyro : ndarray, shape (n + 1, 4)
-        Attitude (w, x, y, z; FRD to NED) of EKF2, and integrated from the gyroscopes starting with
-        the first logged attitude. Gravity corrects the tilt of ``gyro``, not its heading.
+    logged : ndarray, shape (n + 1, 4)
+        EKF2's attitude as quaternion (w, x, y, z; FRD to NED).
+    gyro : ndarray, shape (n + 1, 4)
+        Attitude integrated from the gyroscopes, with the tilt corrected by gravity.
     valid_spans_s : tuple of (float, float)
         Time spans in flight without a gap in the IMU data.
     """
@@ -75,7 +74,7 @@ class Inertial:
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the heading of EKF2 or of the gyroscopes, and the tilt of ``gyro``."""
+        """Attitudes with the tilt of ``gyro``, and the heading of EKF2 or of ``gyro``."""
         return {"EKF2": replace_heading(self.gyro, heading(self.logged)), "gyroscopes": self.gyro}
 
 
@@ -107,10 +106,9 @@ class ImuMotion:
     time_s : ndarray, shape (n,)
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
-        First column: second difference without accelerometer bias. Other columns: change of it per
-        1 m/s² of bias forward, right and down.
+        Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
     rate_m_s : ndarray, shape (n, 3)
-        Time derivative of ``table[..., 0]``.
+        Time derivative of the second difference.
     """
 
     time_s: Array
@@ -151,8 +149,8 @@ def read_inertial(flight: Flight) -> Inertial | None:
 def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
     """Integrate the gyroscopes without their bias, from the first logged attitude.
 
-    The bias is the median difference to the logged rotation: a reset of the logged heading is an
-    outlier of this difference.
+    The bias is the median rotation rate relative to the logged attitude, so heading resets have no
+    effect.
     """
     excess = angle_rad - to_vector(multiply(conjugate(logged[:-1]), logged[1:]))
     total = np.cumsum(excess, axis=0)
@@ -162,7 +160,7 @@ def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
 
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
-    """Correct the tilt of an attitude: the running mean of the specific force becomes vertical."""
+    """Correct the tilt of an attitude, so that the mean specific force is vertical."""
     mean = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
         mean = running_mean(mean, np.ones(len(mean), dtype=bool), round(LEVELLING_S / STEP_S))
@@ -172,7 +170,7 @@ def _level(attitude: Array, force_m_s2: Array) -> Array:
 
 
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
-    """Return the centred running mean over ``width`` rows, of which only valid ones count."""
+    """Return the centred running mean over ``width`` rows, without invalid rows."""
     rows = np.arange(len(values))
     low, high = np.clip(rows - width // 2, 0, None), np.clip(rows + width // 2 + 1, None, len(rows))
     flat = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
@@ -184,21 +182,19 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    """Subtract the running mean over HIGH_PASS_S, and set invalid rows to 0."""
     filtered = values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S))
     filtered[~is_valid] = 0.0
     return filtered
 
 
 def second_difference(position: Array, window: int) -> Array:
-    """Return the second difference p(t + T) - 2 p(t) + p(t - T), with T of ``window`` samples."""
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
 def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     """Integrate the specific force twice to second differences of the position in NED.
 
-    ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED) at each time.
+    ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
     middle = attitude[1:] + attitude[:-1]
     body_to_ned = to_matrix(middle / np.linalg.norm(middle, axis=1, keepdims=True))

@@ -1,8 +1,7 @@
 """Convention of a source's orientation: order of the quaternion, frames, rotation of the body.
 
-The reference is the attitude from the gyroscopes, whose tilt follows gravity. The score of
-a hypothesis depends on the median tilt difference from the reference, and on the median deviation
-of the heading difference from its circular mean.
+Each possible convention is compared with the attitude from the gyroscopes, in tilt and in heading
+changes.
 """
 
 from itertools import product
@@ -40,11 +39,11 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DEG = 12.0
-# Minimum tilt or heading difference (°) in the score: noise causes smaller ones
+# Smaller tilt or heading differences (°) are noise and do not improve the score
 MIN_DIFFERENCE_DEG = 0.7
-# Decrease of the score per second of flight if a difference is e times larger
+# Decrease of the score per second of flight and per unit of ln(difference)
 SCORE_PER_S = 0.5
-# Minimum score of the best convention above the second best, for an unambiguous result
+# Minimum score difference between the best and the second best convention
 MIN_LOG_ODDS = 4.0
 # Maximum number of orientations that are compared with the reference
 MAX_SAMPLES = 600
@@ -53,7 +52,7 @@ MIN_SAMPLES = 20
 
 
 class Candidate(NamedTuple):
-    """Assumed convention of an orientation, with its difference from the reference attitude."""
+    """Possible convention of an orientation, with its difference from the reference attitude."""
 
     convention: OrientationConvention
     heading_difference_deg: float
@@ -61,30 +60,17 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames of the quaternion, with NWU for ENU: both differ only in heading."""
+        """Order and frames of the quaternion; ENU equals NWU, because only the heading differs."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
     inertial: Inertial, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine quaternion order and frames of a source's orientation, or None with few samples.
+    """Determine quaternion order and frames of a source's orientation; None with few samples.
 
-    Parameters
-    ----------
-    inertial : Inertial
-    time_s : ndarray, shape (n,)
-    quaternion : ndarray, shape (n, 4)
-        Orientation as sent; the message defines the order w, x, y, z.
-
-    Returns
-    -------
-    convention : OrientationConvention
-        Without ``heading_error_deg``.
-    time_s : ndarray, shape (m,)
-        At most MAX_SAMPLES of the times in flight.
-    attitude : ndarray, shape (m, 4)
-        Orientation at these times, converted to FRD to NED.
+    Return the convention without ``heading_error_deg``, at most MAX_SAMPLES of the times in flight,
+    and the attitudes (FRD to NED) at these times. ``quaternion``, shape (n, 4), is as sent.
     """
     rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
     if len(rows) < MIN_SAMPLES:
@@ -124,7 +110,6 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 def _make_candidate(
     time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
-    """Convert an orientation by an assumed convention, and compare it with the reference."""
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
     attitude = multiply(to_attitude(sent, convention), turn)

@@ -29,14 +29,14 @@ def with_opposites(axes: Axes) -> list[Direction]:
 
 
 def axes_as_sent(axes: Axes, frame: str) -> Axes:
-    """Return the true directions of x, y, z in a file that was read in another frame.
+    """Return the true directions of x, y, z of a position file.
 
     Parameters
     ----------
     axes : tuple of str
-        True directions of the axes that the reader took for north, east, down.
+        True directions of north, east, down as the reader understood the file.
     frame : {"NED", "ENU", "NWU"}
-        Frame that the reader assumed for the file.
+        Frame that the reader assumed.
     """
     true_directions = dict(zip(DIRECTIONS, with_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
@@ -73,8 +73,8 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
         return fault, f"Write {ned} to the file, and run again with --position-frame ned."
     if name == "ENU":
         return fault, (
-            "With MAVROS publish ENU and FLU on vision_pose/pose, which MAVROS converts to NED. "
-            f"Without MAVROS send {ned}."
+            "With MAVROS, publish the ENU positions on vision_pose/pose: MAVROS converts them to "
+            f"NED. Without MAVROS, send {ned}."
         )
     return fault, f"Send {ned}."
 

@@ -1,9 +1,8 @@
-"""Register of the input files of a command, to which px4fuse never writes.
+"""Register of the input files of a command, so that no output overwrites an input.
 
-Files are identified by device and inode, so that a file is recognised by a link, another path, or a
-name in another case. Readers add each file that they open, and
-:func:`px4fuse.core.writing.write_all` raises an error for a registered file. Only the main process
-of a command has a register, and adds the files of its worker processes before they start.
+Readers register each file that they open. Files are compared by device and inode, because a link or
+another spelling of the path leads to the same file. Worker processes have no register: the main
+process adds their files.
 """
 
 import os
@@ -43,7 +42,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
-    """Do not register files that are read inside the context, because the command replaces them."""
+    """Do not register files inside the context: earlier outputs that the command overwrites."""
     token = _register.set(None)
     try:
         yield
@@ -76,10 +75,7 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder is a file, or contains an input or a link to one.
-
-    Files in the folder and in its subfolders are checked, because outputs are written to both.
-    """
+    """Raise an OutputError if the output folder is a file, or contains an input of the command."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
     register = _register.get() or _Register()

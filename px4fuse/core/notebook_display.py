@@ -4,17 +4,15 @@ from collections.abc import Mapping
 from functools import singledispatch
 from typing import Any
 
+from msgspec import UnsetType
+
 # Maximum length (characters) of a text field in the representation of a record
 MAX_TEXT_LENGTH = 60
 
 
 @singledispatch
 def display_html(result: object) -> str | None:
-    """Return a result as HTML for notebooks.
-
-    The module that formats a type registers a function for the type, because the module of the type
-    must not import it. Return None for other types, which notebooks show as text.
-    """
+    """Return a result as HTML for notebooks; None for types without a registered function."""
     return None
 
 
@@ -29,7 +27,9 @@ def one_line_repr(result: Any) -> str:
     names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
     values = ((name, getattr(result, name)) for name in names)
     field_texts = ", ".join(
-        f"{name}={_format_value(value)}" for name, value in values if value is not None
+        f"{name}={_format_value(value)}"
+        for name, value in values
+        if not isinstance(value, UnsetType | None)
     )
     return f"{type(result).__name__}({field_texts})"
 

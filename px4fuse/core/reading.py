@@ -28,7 +28,6 @@ else:
 #: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
-_BYTES_PER_MB = 1_000_000
 
 
 def display_name(path: Path) -> str:
@@ -41,7 +40,7 @@ def display_name(path: Path) -> str:
 
 
 def split_part(argument: str) -> tuple[Path, str | None]:
-    """Split ``FILE:PART``: a track of a log, a body of a table, or a topic of a ROS bag."""
+    """Split ``FILE:PART``: a track of a log, a rigid body of a table, or a topic of a ROS bag."""
     path, colon, part = argument.rpartition(":")
     if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
         return Path(path), part
@@ -83,10 +82,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
 
 
 def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
-    """Read at most ``count`` first bytes of a regular file.
-
-    Errors are of type ``error_type``.
-    """
+    """Read at most ``count`` first bytes of a regular file."""
     file_size(path, error_type)
     return _read(path, count, error_type, display_name(path))
 
@@ -245,7 +241,7 @@ def _unreadable(
     return error_type(f"{name}: the file cannot be read ({reason}).", remedy)
 
 
-def format_size_limit(name: str, *sizes: int) -> str:
+def format_size_limit(name: str, size: int, limit: int) -> str:
     """Format the error of a file whose size (bytes) exceeds the limit (bytes)."""
-    size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
-    return f"{name}: the file has {size} MB, more than the limit of {limit} MB"
+    size_mb, limit_mb = (f"{n / 1e6:,.{0 if n >= 10_000_000 else 2}f}" for n in (size, limit))
+    return f"{name}: the file has {size_mb} MB, more than the limit of {limit_mb} MB"

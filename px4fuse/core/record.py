@@ -1,7 +1,6 @@
-"""Base class of the records in results: immutable, strictly typed, and written without change.
+"""Base class of the records in results, and :class:`Unavailable` for missing data.
 
-Field names contain the unit. If a number cannot be computed, the number is absent, or an
-:class:`Unavailable` replaces its record.
+Field names contain the unit.
 """
 
 from __future__ import annotations
@@ -9,10 +8,12 @@ from __future__ import annotations
 from abc import ABCMeta
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union
 
 import msgspec
 from msgspec import Meta
+
+from px4fuse.core.notebook_display import one_line_repr
 
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -24,16 +25,18 @@ Span = tuple[float, float]
 Vector = tuple[float, float, float]
 
 
+# Default value of a field that is not written to the results
+NOT_WRITTEN: Any = msgspec.UNSET
+
+
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Immutable record; fields that are None are not written to the results.
 
-    Attributes
-    ----------
-    schema_type : type or None
-        Base class with the fields in the results, if the record also contains arrays or tables.
+    Fields of the type :class:`NotWritten` (arrays, tables) are not written either, and are missing
+    in records that were read from results.
     """
 
-    schema_type: ClassVar[type[Record] | None] = None
+    __repr__ = one_line_repr
 
 
 class Unavailable(Record, frozen=True):
@@ -65,13 +68,19 @@ A = TypeVar("A")
 if TYPE_CHECKING:
     RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - generic alias
     OrUnavailable: TypeAlias = Union[T, Unavailable]  # noqa: UP007
+    NotWritten: TypeAlias = Annotated[T, "not written"]
 else:
 
-    class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
+    class NotWritten:
+        """``NotWritten[T]``: a value T that results do not contain."""
 
-        Each union is a separate type, which :func:`decode_record_or_unavailable` decodes, because
-        msgspec decodes unions of structs only if they have tags, and records have no tags.
+        def __class_getitem__(cls, kind: object) -> type:
+            return msgspec.UnsetType
+
+    class RecordOrUnavailable:
+        """``RecordOrUnavailable[T, A]``: a record T, or an Unavailable of type A.
+
+        msgspec itself decodes such a union only if both types have tags.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -90,13 +99,7 @@ else:
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable`, as ``dec_hook`` of msgspec.
-
-    Raises
-    ------
-    ValueError
-        The value is neither the record nor an Unavailable.
-    """
+    """Decode a :class:`RecordOrUnavailable` for msgspec (argument ``dec_hook``)."""
     record_type, unavailable_type = union_type.union_members
     kind = (
         unavailable_type
@@ -110,12 +113,14 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
 
 
 def to_serializable(value: Any) -> Any:
-    """Convert a record and the records in it to their schema types, without arrays and tables."""
+    """Remove from a record, and the records in it, the fields that are not written."""
     if isinstance(value, Record):
-        kind = value.schema_type or type(value)
-        return kind(
-            **{name: to_serializable(getattr(value, name)) for name in kind.__struct_fields__}
+        written = (
+            field.name
+            for field in msgspec.structs.fields(value)
+            if field.type is not msgspec.UnsetType
         )
+        return type(value)(**{name: to_serializable(getattr(value, name)) for name in written})
     if isinstance(value, Mapping):
         return {key: to_serializable(child) for key, child in value.items()}
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value

@@ -153,7 +153,6 @@ def run_one_bounded(
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
-    """Return True if the worker process can take more jobs, and the result that it sent."""
     try:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):

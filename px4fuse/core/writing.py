@@ -25,26 +25,17 @@ _MAX_LISTED = 4
 def write_all(
     contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
-    """Write outputs in the order of ``contents``, and stop at the first that cannot be written.
+    """Write output files in the order of ``contents``; create missing folders.
 
-    A regular file is written under a temporary name in the same folder and renamed, so that the
-    path always leads to the old or the complete new file. For a symbolic link, the file that it
-    points to is replaced. Standard output, devices and named pipes are written directly.
-
-    Parameters
-    ----------
-    contents : mapping from Path to bytes
-        Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
-    on_written : callable
-        Function that is called with each path after its output is written.
+    Regular files are written under a temporary name and renamed, so that a path always leads to
+    the old or the complete new file. ``on_written`` is called with each path after its writing.
 
     Raises
     ------
     OutputError
-        An output is an input of this command, so nothing is written; or an output cannot be
-        written, and the message lists the outputs written before.
+        An output is an input of this command, or cannot be written.
     BrokenPipeError
-        The reader of a pipe has ended. All other outputs are written.
+        The reader of a pipe has ended; all other outputs are written.
     """
     check_outputs(path for path in contents if path != STANDARD_OUTPUT)
     written_files: list[Path] = []
@@ -94,7 +85,6 @@ def _is_standard_output(path: Path) -> bool:
 
 
 def _file_mode(path: Path) -> int:
-    """Return type and permissions of a file, or the type of a regular file if it does not exist."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:

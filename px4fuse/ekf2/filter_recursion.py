@@ -18,7 +18,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA, SENSORS, HeightFilter, barometer_samples
@@ -198,8 +197,6 @@ class SegmentRun:
     field: Array
     heights: HeightFilter | None = None
     vision: VisionFilter | None = None
-
-    __repr__ = one_line_repr
 
 
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)

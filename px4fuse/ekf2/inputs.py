@@ -12,8 +12,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
+<<<<<<< HEAD
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Span
+||||||| 2f144066
+from px4fuse.core.notebook_display import one_line_repr
+=======
+>>>>>>> main
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -135,8 +140,6 @@ class ReceivedPositions:
     reset_s: Array | tuple[()] = ()
     has_all_resets: bool = False
 
-    __repr__ = one_line_repr
-
 
 @dataclass(frozen=True)
 class FusionRules:
@@ -224,8 +227,6 @@ class Inputs:
     max_interval_s: float = MAX_INTERVAL_S
     logged_height_reason: str = ""
     vision: ReceivedPositions | None = None
-
-    __repr__ = one_line_repr
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)

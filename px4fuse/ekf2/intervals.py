@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import (
     BIASES,
@@ -87,8 +86,6 @@ class Intervals:
     acceleration_input: Array
     gyro_noise: Array
     accelerometer_noise: Array
-
-    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
@@ -104,8 +103,6 @@ class Model:
     flown: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
-
-    __repr__ = one_line_repr
 
 
 def open_model(

@@ -9,8 +9,17 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.core.record import (
+    NOT_WRITTEN,
+    Correlation,
+    Count,
+    NotNegative,
+    NotWritten,
+    Positive,
+    Record,
+    Share,
+    Span,
+)
 from px4fuse.core.text import count_noun
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.replay_segments import SETTLING_S
@@ -185,8 +194,8 @@ class Agreement(Record, frozen=True, kw_only=True):
         )
 
 
-class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """Fields of an EKF2 replay that are written to results.json.
+class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
+    """Replay of EKF2 with one set of parameters.
 
     Attributes
     ----------
@@ -201,21 +210,6 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
         fused late, and never fused.
     agreement : Agreement or None
         Agreement of the replay with logged parameters; None while the agreement is computed.
-    """
-
-    source: str
-    stretches_s: Spans
-    settings: Mapping[str, float]
-    late: Count = 0
-    lost: Count = 0
-    agreement: Agreement | None = None
-
-
-class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
-    """Replay of EKF2 with one set of parameters.
-
-    Attributes
-    ----------
     changed : mapping
         Values of the parameters that differ from the log, by PX4 name.
     updates : DataFrame, shape (m, 14), or (m, 21) with velocity
@@ -237,15 +231,18 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         Position and velocity that the output predictor publishes, at the times of ``delayed``.
     """
 
-    schema_type = Replayed
-    changed: Mapping[str, float]
-    updates: pd.DataFrame
-    delayed: pd.DataFrame
-    published: pd.DataFrame
-    other_aid_updates: Mapping[str, pd.DataFrame] = {}
-    flow_only_spans_s: Spans = ()
-
-    __repr__ = one_line_repr
+    source: str
+    stretches_s: Spans
+    settings: Mapping[str, float]
+    late: Count = 0
+    lost: Count = 0
+    agreement: Agreement | None = None
+    changed: NotWritten[Mapping[str, float]] = NOT_WRITTEN
+    updates: NotWritten[pd.DataFrame] = NOT_WRITTEN
+    delayed: NotWritten[pd.DataFrame] = NOT_WRITTEN
+    published: NotWritten[pd.DataFrame] = NOT_WRITTEN
+    other_aid_updates: NotWritten[Mapping[str, pd.DataFrame]] = NOT_WRITTEN
+    flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     @property
     def evaluated_s(self) -> Spans:

@@ -14,7 +14,6 @@ import pandas as pd
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -110,8 +109,6 @@ class SensorSamples:
     noise: Array
     gate: float = np.inf
 
-    __repr__ = one_line_repr
-
 
 @dataclass(frozen=True)
 class HeightSamples:
@@ -144,8 +141,6 @@ class HeightSamples:
     down_m: Array
     dead_zone_m: Array
     weight: Array
-
-    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -233,8 +228,6 @@ class ReplaySegment:
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "ReplaySegment | None" = None
     changed: Mapping[str, float] = record_field(default_factory=dict)
-
-    __repr__ = one_line_repr
 
     @cached_property
     def imu_velocity_m_s(self) -> Array:

@@ -21,8 +21,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Span
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Span
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
@@ -123,7 +122,7 @@ class UnreplayedDifference(Record, frozen=True):
     at_s: float
 
 
-class DifferenceSteps(Record, frozen=True, kw_only=True):
+class DifferenceExplanation(Record, frozen=True, kw_only=True):
     """Mean square difference KF - EKF2 along one axis, explained by differences of the filters.
 
     The mean square is the sum of the contributions of ``steps`` and a remainder.
@@ -150,6 +149,10 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
         Wrong settings of KF that were corrected first.
     sentences : tuple of str
         Explanations of the difference, largest contribution first.
+    times_s, kf_minus_ekf2_m, unexplained_m : ndarray
+        EKF2 sample times; position differences KF - EKF2, and replay with all steps - EKF2.
+    cause : str
+        Sentence about the property with the largest contribution.
     """
 
     count: Count
@@ -164,31 +167,15 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     outside: UnreplayedDifference | None = None
     corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
+    times_s: NotWritten[Array] = NOT_WRITTEN
+    kf_minus_ekf2_m: NotWritten[Array] = NOT_WRITTEN
+    unexplained_m: NotWritten[Array] = NOT_WRITTEN
+    cause: NotWritten[str] = ""
 
     @property
     def unexplained_fraction(self) -> float:
         """Fraction of the mean square position difference that ``steps`` do not explain."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
-
-
-class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False):
-    """Explanation of the difference KF - EKF2 along one axis, with time series.
-
-    Attributes
-    ----------
-    times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times; position differences KF - EKF2, and replay with all steps - EKF2.
-    cause : str
-        Sentence about the property with the largest contribution.
-    """
-
-    schema_type = DifferenceSteps
-    times_s: Array
-    kf_minus_ekf2_m: Array
-    unexplained_m: Array
-    cause: str = ""
-
-    __repr__ = one_line_repr
 
 
 def explain_by_steps(

@@ -12,13 +12,13 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
-from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
+from px4fuse.card.model import AXIS_ENDS
 from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS, Consistency
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
     DT_RANGE_S,
@@ -95,7 +95,7 @@ def ranges() -> Data:
         "sigma-z": list(SIGMA_Z_RANGE_M),
         "dt": list(DT_RANGE_S),
         "lesson": _settings_data(Settings()),
-        "bands": SIGMA_RATIO_BANDS,
+        "bands": CONSISTENT_RATIOS,
         "ends": list(AXIS_ENDS),
         "marks": MARK_PATHS,
     }

@@ -28,15 +28,13 @@ from px4fuse.core.text import count_noun
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 Interval = tuple[float, float]
-# Minimum number of innovations for a verdict: with fewer, the 95 % band of the mean NIS is wider
-# than 0.3 to 2.1
+# Minimum number of innovations for a verdict; the 95 % band of their mean NIS is 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Number of lags of the Ljung-Box whiteness test
 LJUNG_BOX_LAGS = 10
-# Range of the ratio of actual to reported σ in which a filter is consistent, against the position
-# source and against ground truth. Against ground truth, the ratio of EKF2 is 0.84 to 1.22 in
-# simulated flights without faults, because the σ of EKF2 excludes the lag of the output predictor
+# A filter is consistent if the ratio of actual to reported σ is in this range. The range for ground
+# truth is wider, because EKF2's σ excludes the lag of its output predictor
 Reference = Literal["source", "truth"]
 CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
@@ -48,15 +46,12 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    count : int
-        Number of innovations.
     nis_mean : float
         Mean of ν²/S per degree of freedom; expected 1.
     nis_band : (float, float)
-        Two-sided 95 % chi-square band of the mean NIS, for white innovations.
+        Two-sided 95 % chi-square band of the mean NIS of white innovations.
     sigma_ratio : float
-        Ratio of actual to reported σ, √nis_mean: above 1, the filter is overconfident.
-    verdict : str
+        Ratio of actual to reported σ, √nis_mean; above 1, the filter is overconfident.
     """
 
     count: Count
@@ -67,29 +62,25 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor, at least 1, between reported and actual σ; ``verdict`` gives the direction."""
+        """Factor, at least 1, between reported and actual σ."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
 class Consistency(NisVerdict, frozen=True, kw_only=True):
-    """Statistics of a filter's innovations, compared with the innovation variances S.
+    """Statistics of a filter's innovations ν, compared with the innovation variances S.
 
     Attributes
     ----------
-    innovation_mean_m, innovation_std_m : float
     sqrt_s_median_m : float
         Median of √S, the standard deviation that the filter expects of the innovations.
     fraction_outside_two_sigma : float
         Fraction of the innovations outside ±2√S; expected 0.046.
-    fraction_outside_gate : float
-        Fraction of the innovations outside the gate.
     bias_t, bias_p : float
-        Student's t statistic of the mean innovation against zero, and the two-sided p-value.
+        Student's t statistic of the mean innovation against zero, and its two-sided p-value.
     lag1_autocorrelation : float
-        Lag-1 autocorrelation of ν/√S; positive if the filter lags behind the positions.
+        Autocorrelation of ν/√S at lag 1; positive if the filter lags behind the positions.
     ljung_box_p : float
         p-value of the Ljung-Box whiteness test over ``ljung_box_lags`` lags.
-    ljung_box_lags : int
     """
 
     innovation_mean_m: float
@@ -105,9 +96,9 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
 
 
 class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
-    """NIS of north and east together: sum of both NIS (two degrees of freedom), divided by two.
+    """NIS of north and east together (two degrees of freedom), divided by two.
 
-    The covariance between north and east is omitted for both filters: EKF2 does not log it.
+    The covariance between north and east is omitted, because EKF2 does not log it.
     """
 
 
@@ -141,12 +132,11 @@ def classify_ratio(ratio: float, reference: Reference, interval: Interval | None
 
 
 def ratio_interval(nis_mean: float, band: Interval) -> Interval:
-    """Return the 95 % interval of √(mean NIS) from the mean NIS band of a consistent filter."""
+    """Return the 95 % interval of √(mean NIS)."""
     return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
 
 
 def classify_mean_nis(nis_mean: float, band: Interval) -> Verdict:
-    """Return the verdict on a filter from the mean NIS and its 95 % band."""
     return classify_ratio(nis_mean**0.5, "source", ratio_interval(nis_mean, band))
 
 

@@ -1,24 +1,15 @@
-"""Time correlation of position errors, by a low-pass filter of the source or by correlated noise.
+"""Time correlation of position errors: low-pass filtered positions or time-correlated noise.
 
-The models (white noise, low pass, time-correlated noise) are compared by the likelihood of the same
-positions given the motion from the IMU. Biases, tilt and scale factor error are marginalised
-(:mod:`px4fuse.filter.imu_motion`), and each model has separate maximum-likelihood noises. The
-SIGMA_A of KF is not used: it includes the effect of biases and would hide slow errors.
+Both models are compared with white noise by the likelihood of the positions given the IMU motion
+(:mod:`px4fuse.filter.imu_motion`).
 
-A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
-successive positions and makes the positions lag. The inverse of the low pass, u_k = (z_k - ρ
-z_(k-1)) / (1 - ρ), gives positions with white noise and without lag. So the likelihood of the
-logged positions z is the likelihood of u times the Jacobian Π 1/(1 - ρ) of this inverse.
+- Low pass: z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ). The unfiltered positions u have white
+  noise and no lag. The likelihood of z is that of u times the Jacobian Π 1/(1 - ρ).
+- Time-correlated noise: z = p + c + v with c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w. It causes no lag.
+  Its fit may shift the timestamps, because a time offset also looks like a lag.
 
-Time-correlated noise of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state in the
-measurement: z = p + c + v. Time-correlated noise does not make the positions lag. Both models use
-the logged timestamps. Time-correlated noise is also fitted with timestamps shifted by the estimated
-time offset, because a time offset is another explanation of a lag.
-
-Noise with a time constant much above a second cannot be distinguished from an IMU error, so a long
-τ is only a lower bound. If ground truth is available, τ is fitted to the errors of the positions
-against ground truth. The likelihood of these errors excludes the effects of a rotated, shifted or
-scaled frame and of late timestamps (restricted likelihood, Patterson and Thompson 1971).
+The IMU determines only a lower bound of a τ above a second. With ground truth, τ is fitted to the
+position errors by restricted likelihood (Patterson and Thompson 1971).
 """
 
 from collections.abc import Sequence
@@ -40,47 +31,37 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Maximum number of position measurements in the fits: of a longer flight only the middle is used,
-# to limit the computing time
+# Maximum number of positions in the fits; of a longer flight only the middle is used
 MAX_MEASUREMENTS = 2000
-# Maximum ratio of the interval between two positions to the median interval, for a low pass to
-# correlate the two positions: over a longer interval the correlation is negligible
+# Positions are not correlated over an interval longer than this multiple of the median interval
 MAX_INTERVAL_RATIO = 3.0
-# Time constants (s) in the coarse search for time-correlated noise, which finds the initial values
-# of the full fit
+# Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Fractions of the variance SIGMA_Z² that are time-correlated noise in the coarse search
-COARSE_VARIANCE_SHARES = (0.12, 0.35, 0.8)
+# Time-correlated fractions of the variance SIGMA_Z² in the coarse search
+COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Factors on SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Factors by which all noises are multiplied together in the coarse search
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search, for a full fit of
-# time-correlated noise
+# Minimum gain of log-likelihood over white noise in the coarse search, before a full fit
 MIN_COARSE_GAIN_NATS = 0.5
-# Maximum SIGMA_Z (m) for fitting a low pass without significant time-correlated noise: such smooth
-# positions are probably low-pass filtered
+# Positions with a SIGMA_Z (m) below this limit are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
-# Minimum gain of log-likelihood over white noise in the full fit, for significant time-correlated
-# noise
+# Minimum gain of log-likelihood over white noise in the full fit
 MIN_GAIN_NATS = 2.0
-# Penalty (nats) on the log-likelihood of time-correlated noise with shifted timestamps, compared
-# with a low pass: 1 for each of two additional parameters (Akaike 1974)
+# Penalty (nats) for shifted timestamps: 1 for each of two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant τ of a low pass
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of position errors against ground truth in the fit of time-correlated noise, to
-# limit the computing time
+# Maximum number of position errors against ground truth in the fit, which limits its time
 MAX_TRUTH_MEASUREMENTS = 300
-# Minimum gain of log-likelihood over white noise for accepting the fit to ground truth: a
-# likelihood ratio of 150 for two more parameters
+# Minimum gain of log-likelihood over white noise in the fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
-# Maximum time (s) between a measurement and the nearest sample of ground truth: at 2 m/s² the
-# interpolation error is then 1 cm
+# Maximum time (s) between a measurement and the nearest ground truth: error of 1 cm at 2 m/s²
 MAX_TRUTH_DISTANCE_S = 0.1
 # Number of parts of the flight with separate time offsets in the fit to ground truth
 OFFSET_PART_COUNT = 12
@@ -92,17 +73,16 @@ CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter of the position source, which averages successive positions.
+    """Low-pass filter of the position source.
 
     Attributes
     ----------
     correlation : float
         Correlation of the noise of successive positions; 0 without a low pass.
     lag_s : float
-        Lag of the positions during steady motion, Δt ρ / (1 - ρ): the time constant minus about
-        half a measurement interval.
+        Lag of the positions in steady motion.
     gain_nats : float
-        Gain of log-likelihood over white noise with the logged or the shifted timestamps.
+        Gain of log-likelihood over white noise.
     sigma_z_m : float
         Standard deviation of the white noise of a position before the low pass.
     """
@@ -119,18 +99,14 @@ class TimeCorrelatedNoise:
 
     Attributes
     ----------
-    tau_s : float
-        Correlation time.
-    low_s, high_s : float
-        95 % interval of the correlation time. A fit to the IMU gives only a lower bound;
-        ``high_s`` is then infinite.
+    tau_s, low_s, high_s : float
+        Correlation time with its 95 % interval; ``high_s`` is infinite without ground truth.
     slow_m, white_m : float
         Standard deviations of time-correlated and white noise, per axis.
     gain_nats : float
         Gain of log-likelihood over white noise alone.
     lag_nats : float
-        Gain of log-likelihood of a low pass over time-correlated noise, plus
-        :data:`OFFSET_PENALTY_NATS` if the time-correlated noise is fitted with a time offset.
+        Log-likelihood of a low pass minus that of time-correlated noise.
     """
 
     tau_s: float
@@ -160,7 +136,6 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     axes : tuple of Axis
         Axes with the same measurement times.
     settings : Settings
-        Only ``dt_s`` is used, the interval for which SIGMA_A is defined.
     noises : Noises
         Initial values: estimates of the model with white noise.
     outlier_time_s : ndarray
@@ -225,11 +200,11 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     correlated_noises = [
         replace(
             noises,
-            sigma_z_m=sigma_z_m * (1.0 - share) ** 0.5,
-            correlated_sigma_m=sigma_z_m * share**0.5,
+            sigma_z_m=sigma_z_m * (1.0 - fraction) ** 0.5,
+            correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for share, tau in product(COARSE_VARIANCE_SHARES, COARSE_TAUS_S)
+        for fraction, tau in product(COARSE_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
     (white_score, _), (correlated_score, correlated_start) = (
         _best_of_grid(coarse_motion, offsets, candidate_noises)
@@ -302,16 +277,9 @@ def fit_time_correlation_to_truth(
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Return ``imu_fit`` if it has a larger gain of log-likelihood or ground truth is insufficient.
-
-    Parameters
-    ----------
-    axes, outlier_time_s, clock_offset_s, jumps
-        See :func:`fit_time_correlation`.
-    truths : sequence of DataFrame
-        Ground truth with the column ``position_m``, along each axis.
-    imu_fit, low_pass
-        Results of :func:`fit_time_correlation`, from which ``lag_nats`` is copied.
+    Frame errors and time offsets are removed from the errors first. ``imu_fit`` and ``low_pass``
+    are the results of :func:`fit_time_correlation`; ``imu_fit`` is returned if it has the larger
+    gain.
     """
     min_gain = MIN_TRUTH_GAIN_NATS
     lag_nats = low_pass.gain_nats
@@ -380,11 +348,7 @@ def _fit_noises_at(
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Find the time offset and the noises with the lowest -ln p on a coarse grid.
-
-    Return -ln p and the noises. First SIGMA_A, then all noises together are multiplied by the
-    factors of the coarse search.
-    """
+    """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
     results = []
     for positions in map(prepared_motion.at, offsets_s):
         for candidate, factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):

@@ -1,6 +1,6 @@
 """filterpy's KalmanFilter, imported without scipy.stats, which would take 0.2 s and 17 MB.
 
-filterpy uses scipy.stats only in plots and densities. These functions load it when they are called.
+filterpy uses scipy.stats only in plots and densities, which load it when they are called.
 """
 
 import sys
@@ -17,7 +17,7 @@ class _LazyDistribution:
 
     def __getattr__(self, attribute: str) -> Any:
         stats = import_module("scipy.stats")
-        # during its import, filterpy calls logpdf of the module that replaces scipy.stats
+        # filterpy calls logpdf while it is imported, before scipy.stats can be loaded
         if stats.__spec__ is None:
             return lambda *_, **__: 0.0
         return getattr(getattr(stats, self._name), attribute)

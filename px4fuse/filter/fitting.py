@@ -1,11 +1,9 @@
 """Maximum-likelihood estimates of SIGMA_A and SIGMA_Z, and outliers among the positions.
 
-The innovations of a filter with correct noises are white and have the expected variance. The
-correct noises maximise the likelihood of the innovations (Schweppe 1965). Outliers are modelled as
-measurements from a normal distribution that is many times wider (Tukey 1960). Expectation
-maximisation estimates the fraction of outliers, their width (σ of outliers over SIGMA_Z) and the
-probability that a measurement is an outlier. This probability uses the errors of all axes of a
-measurement given all data.
+The noises maximise the likelihood of the innovations (Schweppe 1965). Outliers have a normal
+distribution that is many times wider (Tukey 1960). Expectation maximisation estimates their
+fraction, their width (σ of outliers over SIGMA_Z) and the probability that a measurement is an
+outlier.
 """
 
 from collections.abc import Iterable, Sequence
@@ -46,19 +44,17 @@ START_OUTLIER_SHARE = 0.005
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_SHARE = 0.4
-# Maximum ratio of SIGMA_Z to the robust estimate from the median of the squared errors, while
-# outliers are estimated
+# While outliers are estimated, SIGMA_Z exceeds its robust estimate (median) at most by this factor
 MAX_SIGMA_Z_RATIO = 1.2
-# Maximum change of an outlier probability in the last iteration of expectation maximisation
+# Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_PROBABILITY_CHANGE = 0.01
-# Value used as -ln p per measurement if -ln p cannot be computed: larger than any computed value
+# Replaces -ln p per measurement if it cannot be computed; larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number of nodes for polynomial interpolation of the likelihood, and distance of the nodes in ln σ
+# Number of nodes for interpolation of the likelihood, and distance of the nodes in ln σ
 LIKELIHOOD_NODES = 10, 0.25
-# Number and distance in ln σ of the interpolation nodes while the outlier probabilities still
-# change: an approximate maximum of the likelihood is then sufficient
+# The same, while the outlier probabilities still change and a coarse maximum is sufficient
 COARSE_LIKELIHOOD_NODES = 6, 0.2
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
@@ -70,12 +66,14 @@ class Noises:
 
     Attributes
     ----------
-    sigma_a_m_s2, sigma_z_m : float
-        Noise of the acceleration (defined as KF's SIGMA_A), and of each position measurement.
+    sigma_a_m_s2 : float
+        Noise of the acceleration over one DT.
+    sigma_z_m : float
+        White noise of a position.
     random_walk_m : float
-        Random walk of the source (m/√s); 0 for a source that does not drift.
+        Random walk of the source (m/√s); 0 if the source does not drift.
     correlated_sigma_m, tau_s : float
-        Standard deviation and time constant of the source's time-correlated noise; 0 for none.
+        Standard deviation and time constant of time-correlated noise; 0 without it.
     """
 
     sigma_a_m_s2: float
@@ -96,12 +94,10 @@ SEARCH_RANGES = {
 
 
 class Likelihood:
-    """Negative log-likelihood of the measurements (without a constant) as a function of the noises.
+    """-ln p of the measurements (without a constant) as a function of the noises.
 
-    Without random walk and correlated noise, -ln p is a smooth function of ln(SIGMA_A/SIGMA_Z) and
-    ln SIGMA_Z. This function is computed on demand at nodes and interpolated with polynomials. The
-    singularities of the function are π/2 from the real axis, so the interpolation error is at the
-    level of rounding.
+    For white noise, -ln p is a smooth function of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. It is
+    computed at nodes and interpolated by polynomials, with an error of the size of rounding errors.
 
     Parameters
     ----------
@@ -110,9 +106,9 @@ class Likelihood:
     weight : ndarray, shape (m,)
         Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
-        Approximate SIGMA_Z: an initial state is known if its prior σ is small compared with it.
+        Approximate SIGMA_Z, the unit of all noises.
     is_coarse : bool
-        True to interpolate between fewer nodes, if an approximate maximum is sufficient.
+        True for fewer nodes, if an approximate maximum is sufficient.
     """
 
     def __init__(
@@ -171,9 +167,9 @@ def _barycentric_signs(count: int) -> Array:
 
 
 def _interpolation_weights(position: float, count: int) -> Array:
-    """Return the weights of the values at 0, 1, ... for interpolation at a position.
+    """Return the weights of the values at 0, 1, ... for barycentric interpolation at a position.
 
-    The method is barycentric interpolation (Berrut and Trefethen 2004).
+    Berrut and Trefethen (2004).
     """
     distances = position - np.arange(count)
     if not distances.all():
@@ -189,20 +185,10 @@ def fit_ratios(
     weight: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
-    """Fit positions for several ratios SIGMA_A / SIGMA_Z, with all noises in units of SIGMA_Z.
+    """Fit positions for several ratios SIGMA_A / SIGMA_Z (1/s²), in units of SIGMA_Z.
 
-    Parameters
-    ----------
-    position_batches : iterable of Positions
-        The same positions with different time offsets.
-    ratios : sequence of float
-        SIGMA_A / SIGMA_Z, 1/s².
-    random_walk : float
-        Random walk of the source / SIGMA_Z, per √s.
-    weight : ndarray, shape (m,)
-        Weight of each measurement: its variance is SIGMA_Z² / weight.
-    sigma_z_m : float
-        SIGMA_Z, the unit of all noises.
+    ``position_batches`` are the same positions with different time offsets; ``random_walk`` is the
+    random walk of the source / SIGMA_Z, per √s.
     """
     scaled_batches = (
         positions.in_sigma_z_units(sigma_z_m, random_walk, weight) for positions in position_batches
@@ -222,7 +208,7 @@ def fit_ratios(
 def fit_noises(
     position_batches: Iterable[Positions], noises: Noises, weight: Array
 ) -> FittedPositions:
-    """Fit positions with one set of noises; a measurement has the variance SIGMA_Z² / weight."""
+    """Fit positions with one set of noises; the variance of a measurement is SIGMA_Z² / weight."""
     sigma = noises.sigma_z_m
     if noises.correlated_sigma_m:
         position_batches = (
@@ -249,16 +235,13 @@ class NoiseFit:
 
     Attributes
     ----------
-    noises : Noises
     weight : ndarray, shape (m,)
-        Weight of each measurement: 1 for a good measurement, 1/width² for an outlier.
+        1 for a good measurement, 1/width² for an outlier.
     outlier_probability : ndarray, shape (m,)
-        Probability that the measurement is an outlier.
     score : Likelihood
-        -ln p as a function of the noises, with the weights ``weight``.
+        -ln p as a function of the noises.
     sigma_z_variance_factor : float
-        Factor, at least 1, on the variance of ln SIGMA_Z from the curvature of the likelihood. The
-        outliers are also estimated, which adds uncertainty.
+        Factor on the variance of ln SIGMA_Z, at least 1, because the outliers are uncertain.
     """
 
     noises: Noises
@@ -269,12 +252,12 @@ class NoiseFit:
 
     @property
     def lowest_score(self) -> float:
-        """Value of ``score`` at the maximum-likelihood noises."""
+        """-ln p at the maximum-likelihood noises."""
         return self.score(self.noises)
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """Convert the input of KF to positions with an unknown error of the initial state."""
+    """Convert the input of KF to positions; the error of the initial state is unknown."""
     count = len(intervals.measurement_m)
     prior_precision = np.zeros((count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
@@ -282,7 +265,7 @@ def filter_positions(intervals: Preintegrated) -> Positions:
     dp, dv = np.zeros((2, 1, 1, 3, count))
     dp[0, 0, 0] = intervals.delta_position_m
     dv[0, 0, 0] = intervals.delta_velocity_m_s
-    # an error of the initial state acts as an increment in the first interval
+    # an initial position or velocity error changes only the first increment
     dp[0, 0, 1:, 0] = (1.0, intervals.length_s[0])
     dv[0, 0, 2, 0] = 1.0
     return centre_on_path(
@@ -361,11 +344,7 @@ def maximise_likelihood(
 def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Compute the expected squared error (m²) of each measurement, summed over its axes.
-
-    Return also the number of axes of each measurement. Biases and initial states have their
-    maximum-likelihood values.
-    """
+    """Return the expected squared error (m²) and the number of axes of each measurement."""
     results = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
@@ -387,21 +366,11 @@ def _outlier_probability(
 def outlier_variance_factor(
     square: Array, count: Array, outlier_probability: Array, width: float
 ) -> float:
-    """Return the variance of ln SIGMA_Z, relative to the variance if the outliers were known.
+    """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
 
-    The Fisher information with known outliers minus the missing information is the information of
-    the data (Louis 1982). The missing information is the covariance of the score over the possible
-    sets of outliers. Parameters are ln σ, ln width and the log odds of the fraction of outliers.
-
-    Parameters
-    ----------
-    square : ndarray, shape (m,)
-        Squared error of each measurement / σ², summed over its axes.
-    count : ndarray, shape (m,)
-        Number of axes of each measurement.
-    outlier_probability : ndarray, shape (m,)
-    width : float
-        σ of the outliers over σ of good measurements.
+    Observed information = complete information - missing information (Louis 1982), for the
+    parameters ln σ, ln width and the log odds of an outlier. ``square`` is the squared error of
+    each measurement / σ², summed over its ``count`` axes.
     """
     outlier_share = np.mean(outlier_probability)
     sigma_information = 2.0 * float(np.sum(count))
@@ -434,7 +403,7 @@ def _maximise_by_gradient(
     count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
-        # a score per measurement limits the first step of L-BFGS-B to about 1
+        # divided by the number of measurements, the gradient and the first step are about 1
         try:
             return likelihood(to_noises(logs)) / count
         # far from the maximum rounding errors dominate; the large value makes L-BFGS-B shorten the

@@ -1,11 +1,13 @@
 """Misalignment in yaw between the position source's frame and EKF2's heading, over the flight.
 
 Indoors a disturbed magnetometer may rotate EKF2's heading by tens of degrees within one flight, so
-one angle for the flight is not enough. If the source measures an orientation, its heading is
-compared with EKF2's heading. Otherwise the flight is divided into parts. In each part the attitude
-is integrated from the gyroscopes, and its initial heading error is estimated from positions and
-acceleration (:mod:`px4fuse.filter.imu_motion`). A chi-square test decides if the heading errors of
-all parts are equal.
+the misalignment is estimated for each part of the flight:
+
+- If the source measures an orientation, its heading is compared with EKF2's heading.
+- Otherwise the heading is integrated from the gyroscopes, and its error in each part is estimated
+  from positions and acceleration (:mod:`px4fuse.filter.imu_motion`).
+
+A chi-square test decides if the misalignment changes.
 """
 
 from typing import Literal
@@ -16,7 +18,6 @@ from msgspec import structs
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, median_interval
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -30,52 +31,44 @@ from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# Length (s) of the parts of the flight in which the headings of source and EKF2 are compared, if
-# the source measures an orientation
+# Length (s) of the parts of the flight if the source measures an orientation
 PART_LENGTH_S = 2.0
-# Length (s) of the parts of the flight in which a heading error is estimated, if the source
-# measures no orientation
+# Length (s) of the parts of the flight if the source measures no orientation
 POSITION_PART_LENGTH_S = 15.0
-# Minimum length (s) of a part of the flight, between IMU gaps, for estimating a heading error from
-# positions
+# Minimum length (s) of a part of the flight for an estimate from positions
 MIN_POSITION_PART_S = 5.0
-# Minimum number of parts of the flight for comparing the headings of source and EKF2
+# Minimum number of parts for a comparison of orientations
 MIN_PARTS = 3
-# Minimum number of positions for estimating the heading error from positions
+# Minimum number of positions for an estimate from positions
 MIN_MEASUREMENTS = 50
 # Minimum number of orientation samples in a part of the flight
 MIN_PART_SAMPLES = 3
-# Maximum number of positions: longer tracks are downsampled, because more positions take time and
-# hardly improve the heading
+# Maximum number of positions; longer tracks are downsampled, as more hardly improve the heading
 MAX_MEASUREMENTS = 1000
-# Maximum p-value of the hypothesis "constant heading error" for reporting a change in flight
+# The heading error changes in flight if the p-value of "constant" is below this limit
 MAX_DRIFT_P_VALUE = 0.002
-# Minimum change (°) of the heading error in flight for reporting the change
+# Minimum reported change (°) of the heading error in flight
 MIN_DRIFT_DEG = 5.5
-# Maximum yaw rate (°/s) at which the headings of source and EKF2 are compared: at a higher rate, a
-# delay of 0.2 s would look like a heading error of more than 2°
+# Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s causes an error of 2°
 MAX_YAW_RATE_DEG_S = 10.0
-# Minimum σ (°) of a heading difference between source and EKF2: allows for mounting, vibration and
-# rounding
+# Minimum σ (°) of a heading difference between source and EKF2
 MIN_SIGMA_DEG = 0.5
 # Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of linearised fits of the heading error; each fit starts at the previous result
+# Maximum number of iterations of the linearised fit
 MAX_LINEARISATIONS = 5
-# Maximum change (rad) of the heading error in the last fit: with a smaller change the fits have
-# converged
+# The linearised fit has converged if the heading error changes by less than this (rad)
 MAX_FINAL_STEP_RAD = 0.01
-# Prior σ (rad) of the heading error at the start of a part: wide, because the frame may be
-# misaligned
+# Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
-# Minimum ratio of IMU motion to position motion: the heading error is divided by this ratio
+# Minimum estimated scale of the positions, which prevents a division by zero
 MIN_SCALE = 0.1
 # Index of the heading error among the unknown constants of a part of the flight
 HEADING_CONSTANT = 2
 
 
 class HeadingPart(Record, frozen=True):
-    """Yaw misalignment of the position source in one part of the flight: span (s), angle, σ (°)."""
+    """Yaw misalignment in one part of the flight."""
 
     start_s: float
     end_s: float
@@ -84,22 +77,18 @@ class HeadingPart(Record, frozen=True):
 
 
 class HeadingError(Record, frozen=True):
-    """Misalignment in yaw between the source's frame and the logged attitude, over the flight.
+    """Misalignment in yaw between the source's frame and the logged attitude.
 
     Attributes
     ----------
-    misalignment_deg : float
-        Mean over the flight.
-    sigma_deg : float
-        Standard deviation of ``misalignment_deg``. Not reduced by averaging over the parts, because
-        the errors of all parts are correlated.
+    misalignment_deg, sigma_deg : float
+        Mean over the flight, and its σ; the errors of all parts are correlated.
     drifts : bool
         True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
     parts : tuple of HeadingPart
-        Consecutive parts of the flight. Angles are clockwise from above and include the constant
-        misalignment.
+        Angles in consecutive parts of the flight, clockwise from above.
     drift_p : float
-        p-value of the hypothesis that the angle is constant.
+        p-value of a constant angle.
     by : {"orientation", "positions"}
         Data of the position source from which the angle is estimated.
     """
@@ -111,11 +100,9 @@ class HeadingError(Record, frozen=True):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    __repr__ = one_line_repr
-
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:
-        """The parts of the flight with the smallest and the largest angle, in time order."""
+        """Parts with the smallest and the largest angle, in time order."""
         angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
         return self.parts[first_index], self.parts[last_index]
@@ -124,7 +111,6 @@ class HeadingError(Record, frozen=True):
 def combine_heading_parts(
     parts: tuple[HeadingPart, ...], drift_p: float, method: Literal["orientation", "positions"]
 ) -> HeadingError:
-    """Combine the heading errors of the parts of a flight into one result."""
     angles_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
         misalignment_deg=float(np.mean(angles_deg)),
@@ -152,15 +138,11 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     track : PositionTrack
     segment : Segment
     settings : Settings
-        ``dt_s``, the interval for which SIGMA_A is defined, and the initial value of SIGMA_A.
+        ``sigma_a_m_s2`` is the initial value of the acceleration noise.
     sigma_z_m : float
         Initial value of the position noise.
     offset_s : float
         Time offset added to the timestamps of the track.
-
-    Returns
-    -------
-    HeadingError, or Unavailable without attitude or with too few measurements or IMU samples.
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
@@ -187,8 +169,8 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
     noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
-    # orientations do not give the misalignment, because the mounting angle of the source is
-    # unknown; but if the headings have a constant difference, the misalignment is constant
+    # the mounting angle of the source is unknown, so an orientation only shows if the misalignment
+    # is constant
     return _estimate_from_positions(
         flight, samples, noises, settings.dt_s, is_constant=orientation_result is not None
     )
@@ -215,14 +197,13 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
 
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
-    """Return the headings of attitude quaternions (rad, clockwise from above), unwrapped."""
     return heading(quaternions[Columns.QUATERNION].to_numpy())
 
 
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """Compare the source's heading with EKF2's logged heading; return None with too few samples."""
+    """Compare the source's heading with EKF2's logged heading; None with too few samples."""
     samples = cut_to_segment(orientation, segment)
     time_s = samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
@@ -256,7 +237,7 @@ def _compare_orientations(
 def _estimate_from_positions(
     flight: Flight, samples: pd.DataFrame, noises: Noises, dt_s: float, *, is_constant: bool
 ) -> HeadingError | Unavailable:
-    """Estimate the heading error at the start of each part of the flight, from positions and IMU.
+    """Estimate the heading error of each part of the flight from positions and IMU.
 
     With ``is_constant``, all parts have the same heading error.
     """
@@ -285,12 +266,12 @@ def _estimate_from_positions(
         if not is_long.any():
             return Unavailable(
                 "heading error",
-                f"all parts between gaps of the IMU are shorter than {MIN_POSITION_PART_S:g} s",
+                f"no part of the flight without an IMU gap has {MIN_POSITION_PART_S:g} s",
                 "Analyse a longer segment.",
             )
         positions = motion.at(0.0)
-        # the path without IMU noise is used for both sensitivities: noise in the sensitivity to the
-        # heading would bias the estimate to zero (errors in variables)
+        # use the path without IMU noise as sensitivity to the heading: noise would bias the
+        # estimate to zero (errors in variables)
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_CONSTANT] = -east_m, north_m
@@ -298,7 +279,7 @@ def _estimate_from_positions(
         fit = fit_noises([positions], noises, motion.weight)
         constants = fit.constants()[is_long, 0]
         covariance = np.linalg.inv(fit.information())[is_long, 0]
-        # the sensitivity to the heading is relative to the path before its scale is corrected
+        # the path has the scale of the positions, which is estimated too
         scale = np.maximum(1.0 + constants[:, -1], MIN_SCALE)
         error_rad = constants[:, HEADING_CONSTANT] / scale
         variance = covariance[:, HEADING_CONSTANT, HEADING_CONSTANT] / scale**2
@@ -307,11 +288,10 @@ def _estimate_from_positions(
         if abs(step_rad) < MAX_FINAL_STEP_RAD:
             break
     difference_rad = error_rad - step_rad
-    # variance of the heading error in flight: variance of the estimates minus the variance of their
-    # errors
+    # variance of the true heading error: variance of the estimates minus that of their errors
     excess_variance = max(float(np.mean(difference_rad**2 - variance)), 0.0)
     drift_variance = 0.0 if is_constant else excess_variance
-    # each estimate moves towards the mean by the fraction of its variance that is estimation error
+    # shrink each estimate towards the mean, according to its estimation error
     drift_fraction = drift_variance / (drift_variance + variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [

@@ -1,15 +1,12 @@
 """Biases, scale factor error and jumps that explain the innovations better than noise.
 
-KF is linear, so an error in the measurements or in the acceleration adds its response to the
-innovations. Each hypothetical error is therefore a column of a design matrix: the response of the
-innovations to an error of one unit. Generalised least squares (whitened by √S) estimates the error,
-its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones 1976).
-Effects that could be confused with each other are fitted together: constant accelerometer biases, a
-rotation of the frame, and a slow acceleration error as caused by tilt.
+KF is linear, so an error of the measurements or of the acceleration adds its response to the
+innovations. The response to a unit error is a column of a design matrix. Least squares, weighted by
+S, estimates all errors together (generalised likelihood ratio, Willsky and Jones 1976):
+accelerometer biases, a rotation of the frame, a slow tilt error and jumps.
 
 A scale factor also multiplies the noise of the acceleration, which would bias the regression
-(errors in variables). So the residuals at each scale are weighted with their variance at that scale
-(Deming 1943).
+(errors in variables). It is therefore found by fits with several scales (Deming 1943).
 """
 
 from __future__ import annotations
@@ -28,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -51,26 +47,23 @@ MAX_KNOTS = 40
 # Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Factors on KF's SIGMA_A that are tested: with fitted biases and tilt, the acceleration noise is
-# smaller
+# Tested factors on KF's SIGMA_A: with fitted biases and tilt, the acceleration noise is smaller
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
-# Number of possible jump times that are tested in one computation, to limit memory
+# Number of possible jump times per computation, which limits memory
 STEP_BATCH_SIZE = 200
-# Time (s) after a jump in which measurements are ignored, so that a burst of outliers is not
-# detected as a jump
+# Measurements within this time (s) after a jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Time (s) after a jump in which outliers are tested again: they may be good measurements of the
-# shifted positions
+# Outliers within this time (s) after a jump are tested again: they may be good shifted positions
 OUTLIERS_AFTER_STEP_S = 6.0
 # Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
 # Maximum probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of possible jump times that are compared to find the exact time of a jump
+# Maximum number of candidates for the exact time of a jump
 MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias for a finding: half of EKF2's limit EKF2_ABL_LIM
@@ -91,7 +84,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting jump of the positions: time (s), length along each axis (m), test statistic χ²."""
+    """Lasting jump of the positions, with its length along each axis (m) and its test statistic."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -99,7 +92,6 @@ class Jump:
 
     @property
     def size_m(self) -> float:
-        """Length of the jump vector (m)."""
         return float(np.hypot.reduce([step.value for step in self.step_m]))
 
 
@@ -110,14 +102,11 @@ class BiasScaleJumpFit:
     Attributes
     ----------
     forward_bias, right_bias : Estimate
-        Accelerometer bias (m/s²), body axes. At constant heading a constant tilt has the same
-        effect.
+        Accelerometer bias (m/s²). At constant heading, tilt has the same effect.
     rotation : Estimate
-        Rotation of the source's frame relative to the attitude (rad, clockwise from above),
-        fitted together with the biases.
+        Rotation of the source's frame relative to the attitude (rad, clockwise from above).
     scale : Estimate
-        Scale factor error: distances of the source over distances from the IMU, minus 1.
-    jumps : tuple of Jump
+        Distances of the source over distances of the IMU, minus 1.
     sigma_a_m_s2 : float
         White noise of the acceleration that remains after the fit.
     """
@@ -128,8 +117,6 @@ class BiasScaleJumpFit:
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
-
-    __repr__ = one_line_repr
 
     @property
     def bias(self) -> Estimate:
@@ -142,7 +129,6 @@ class BiasScaleJumpFit:
 
     @property
     def has_bias(self) -> bool:
-        """True if the bias exceeds 0.2 m/s² and 4 σ."""
         return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
 
 
@@ -165,7 +151,6 @@ def fit_bias_scale_jumps(
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
     settings : Settings
-        Only ``dt_s`` is used, the interval for which SIGMA_A is defined.
     sigma_a_m_s2, sigma_z_m : float
         KF's maximum-likelihood noises.
     outlier_time_s : ndarray
@@ -173,11 +158,7 @@ def fit_bias_scale_jumps(
     clock_offset_s : float
         Time offset added to the timestamps.
     announced_s : sequence of float
-        Timestamps of announced jumps (``reset_counter``).
-
-    Returns
-    -------
-    BiasScaleJumpFit, or Unavailable without acceleration or with too few measurements.
+        Timestamps of jumps that the source announced (``reset_counter``).
     """
     design = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(design, Unavailable):
@@ -204,14 +185,14 @@ def fit_bias_scale_jumps(
 def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
-    """Find the maximum-likelihood SIGMA_A on a grid; return it with the fit of all columns."""
+    """Return the maximum-likelihood SIGMA_A on a grid, and the fit with it."""
     fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Find the minimum of a sequence with a single minimum, starting in the middle."""
+    """Return the index of the only minimum of a sequence, searched from the middle."""
     index = count // 2
     step = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + step < count and score(index + step) < score(index):
@@ -245,10 +226,8 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    A jump is tested at the announced times, at the best time of a scan over all times, and at the
-    start of each run of outliers: the first measurements after a jump look like outliers. Each test
-    ignores the measurements of the next second, so that a burst of outliers is not detected as a
-    jump. The exact time is determined last, because the length of the jump depends on it.
+    Tested times: announced jumps, the best time of a scan, and the start of each run of outliers,
+    because the first measurements after a jump look like outliers.
     """
     jumps: list[Jump] = []
 
@@ -292,10 +271,7 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 def _significant_step_times(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array | None = None
 ) -> list[float]:
-    """Test a jump at each of ``times``; return the significant times, largest χ² first.
-
-    By default the times of all measurements are tested.
-    """
+    """Return the times of significant jumps, largest χ² first; by default all times are tested."""
     if times is None:
         times = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
         times = times[:: max(1, -(-len(times) // MAX_TESTED_TIMES))]
@@ -310,7 +286,7 @@ def _significant_step_times(
 def _step_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
 ) -> Array:
-    """Compute χ² of a jump at each time: the decrease of the sum of squared residuals."""
+    """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
     data, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
     base_fit = design.regress(data, columns, log_variance_sum, is_skipped)
     chi_square = np.zeros(len(times))
@@ -335,7 +311,7 @@ def _step_chi_squares(
 def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Find the exact time and the length of a detected jump; return also a mask of outliers."""
+    """Return a detected jump with its exact time and length, and a mask of outliers."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
     # exclude the measurements near the jump; use later outliers again if they agree with the jump
     chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
@@ -362,7 +338,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Test a jump without the skipped measurements; return None if the jump is not significant."""
+    """Test a jump without the skipped measurements; return None if it is not significant."""
     design, columns = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
@@ -382,7 +358,7 @@ def _test_step(
 
 @dataclass(frozen=True)
 class DesignFit:
-    """Generalised least squares of whitened innovations on the columns of a design matrix.
+    """Least squares fit of whitened innovations with the columns of a design matrix.
 
     Attributes
     ----------
@@ -392,11 +368,11 @@ class DesignFit:
         Whitened innovations minus the fit.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
     square_sum : float
-        Residual sum of squares, including the term of the prior.
+        Sum of the squared residuals and of the squared prior deviations.
     score : float
         Restricted negative log-likelihood.
     residual_rms : float
-        Root mean square of the residual; 1 for correct noises.
+        RMS of the residual; 1 for correct noises.
     """
 
     axis: IntArray
@@ -409,38 +385,31 @@ class DesignFit:
 
     @property
     def axis_rms(self) -> Array:
-        """RMS residual along each axis in units of √S; at least 1, the value for correct noises."""
+        """RMS residual along each axis in √S, but at least 1."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return one coefficient with its σ, multiplied by ``residual_rms`` if this exceeds 1."""
+        """Return one coefficient; its σ includes a ``residual_rms`` above 1."""
         sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
 
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Innovations of all axes and the columns of all hypotheses, before whitening.
-
-    Symbols in shapes: m measurements, a axes, k columns, j jumps.
+    """Innovations of several axes and the columns of all hypothetical errors, before whitening.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
-    axis_count : int
-        Number of axes, a.
     signals : Preintegrated
-        Input of KF, integrated between measurements. Columns for each axis: the data, then the
-        effects of unit biases forward and right, and of a unit rotation of the frame. Last columns,
-        for all axes: the effect of a slow acceleration error, interpolated between knots (hat
-        functions of time); each axis has separate coefficients.
+        Columns of each axis: data, response to unit biases forward and right, and to a unit
+        rotation. Last columns, for all axes: response to a slow acceleration error (hat functions).
     prior_sigma : ndarray, shape (k,)
-        Prior standard deviations of the coefficients, except the coefficients of jumps.
-    sigma_z_m : float
+        Prior σ of the coefficients, except those of jumps.
     step_columns : ndarray, shape (m, j)
-        Unit jumps of the measurements: j more columns per axis.
+        Unit steps at the times of j jumps.
     """
 
     time_s: Array
@@ -471,19 +440,16 @@ class DesignMatrix:
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit all columns, with a scale factor on the acceleration and on its noise.
+        """Fit all columns; ``scale`` multiplies the acceleration and its noise.
 
-        ``is_skipped``, shape (m,), is True for measurements that filter and fit exclude.
+        ``is_skipped``, shape (m,), is True for measurements that KF and the fit exclude.
         """
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
     def regress(
         self, data: Array, columns: Array, log_variance_sum: float, is_skipped: BoolArray
     ) -> DesignFit:
-        """Fit whitened innovations with whitened columns, without the skipped measurements.
-
-        ``data``, ``columns`` and ``log_variance_sum`` are the result of :meth:`whitened_design`.
-        """
+        """Fit whitened innovations with whitened columns (from :meth:`whitened_design`)."""
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
         data = data[:, ~is_skipped].ravel()
         columns = columns[:, ~is_skipped].reshape(len(axis), -1)
@@ -513,16 +479,12 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations, their design matrix, and Σ ln S.
-
-        With a axes, m measurements and k unknowns, the shapes are (a, m) and (a, m, k).
-        """
+        """Return whitened innovations (a, m), their design matrix (a, m, k), and Σ ln S."""
         signals, axes, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
-        # the scale multiplies the measured acceleration and the signal of a frame rotation, not the
-        # biases
+        # the scale does not multiply the biases
         data_columns = (1 + CONSTANT_COUNT) * np.arange(axes)
         scales = np.ones(signals.measurement_m.shape[1])
         scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
@@ -557,10 +519,7 @@ def make_design_matrix(
     sigma_z: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Build the design matrix without jumps.
-
-    The axes have the same measurement times; ``clock_offset_s`` is added to the timestamps.
-    """
+    """Build the design matrix without jumps; ``clock_offset_s`` is added to the timestamps."""
     acceleration, attitude = axes[0].acceleration, flight.attitude
     if isinstance(acceleration, Unavailable):
         return acceleration
@@ -600,7 +559,7 @@ def make_design_matrix(
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
-        # all axes share one process noise: in gaps of the IMU, the mean over the axes
+        # all axes share one process noise, also the additional one in gaps of the IMU
         noise_fixed=np.mean([each.noise_fixed for each in axis_inputs], axis=0),
         initial=replace(axis_inputs[0].initial, position_m=0.0),
     )
@@ -629,7 +588,7 @@ def _common_accelerations(
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
-    """Make hat functions for linear interpolation between knots: times (n,) and values (h, n)."""
+    """Return times (s), and at these times the linear interpolation weight of each knot."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knots = np.linspace(start_s, end_s, knot_count)
@@ -637,5 +596,5 @@ def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
-    """Return unit step functions that start at ``starts_s``, at the times ``time_s``: (m, j)."""
+    """Return unit step functions that start at ``starts_s``, shape (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

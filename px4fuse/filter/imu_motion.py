@@ -1,17 +1,16 @@
-"""Motion from the IMU alone, and the sensitivity of this motion to every constant IMU error.
+"""Motion from the IMU alone, and its sensitivity to every constant IMU error.
 
 A segment is a part of the flight, at most 30 s long, without a gap in IMU or attitude. The attitude
-is integrated from the gyroscopes, starting at EKF2's logged attitude at the start of each segment.
-EKF2's later attitude is not used: EKF2 corrected it with the positions to be tested, so it contains
-the delay of the positions.
+is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later attitude is not used,
+because it was corrected with the positions to be tested.
 
-To first order the acceleration is linear in ten unknown constants of each segment: errors of the
-initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and the
-scale of the positions. The signal of a constant is the sensitivity of the motion to this constant.
-The signals are integrated once; a time offset only changes the times at which the integrals are
-interpolated. The signal of the scale is the acceleration of the smooth path of
-:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The acceleration of the IMU is not
-suitable: much of its noise would be explained as scale (errors in variables, Fuller 1987).
+Unknown constants of each segment: errors of the initial attitude (rad, NED), gyro biases (rad/s,
+body), accelerometer biases (m/s², body) and the scale of the positions. The motion is linear in
+small constants. Its sensitivities are integrated once and interpolated for any time offset.
+
+The sensitivity to the scale is the smooth path of
+:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. IMU motion would not be suitable, because
+its noise would be explained as scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum length (s) of a segment: the linearisation requires small angles. In 30 s a gyro bias of
-# 0.004 rad/s rotates the attitude by 0.12 rad, with a second-order error of 0.07 m/s²
+# Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
+# 0.12 rad, with a linearisation error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
 # Largest time offset (s) of the search
 MAX_OFFSET_S = 0.6
@@ -47,7 +46,7 @@ MAX_OFFSET_S = 0.6
 COARSE_OFFSETS = 25
 # Approximate number of measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
-# Maximum number of signal values that are computed together, to limit memory
+# Maximum number of values per computation, which limits memory
 SIGNALS_PER_BATCH = 2**16
 # Minimum number of time offsets that are computed together
 MIN_BATCH_OFFSETS = 3
@@ -60,7 +59,7 @@ MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
-# it keeps the equations regular for an axis with hardly any measurement
+# it avoids a singular matrix
 START_PRECISION = 1e-6, 1e-4
 # Maximum median interval (s) of IMU samples: in a longer interval the motion is unknown
 MAX_IMU_INTERVAL_S = 0.025
@@ -68,12 +67,11 @@ MAX_IMU_INTERVAL_S = 0.025
 
 @dataclass(frozen=True)
 class Signals:
-    """Motion of one segment from the IMU, and its sensitivity to constant attitude and IMU errors.
+    """Motion of one segment from the IMU, and its sensitivity to constant errors.
 
-    ``table`` contains position, velocity and acceleration along each axis of NED at each time; its
-    shape is (n, 3, 3, 1 + constants). Index 0 of the last dimension is the motion with all
-    constants zero, followed by the sensitivities to all constants except the scale. Each
-    acceleration applies until the next time.
+    ``table``, shape (n, 3, 3, 1 + constants), contains position, velocity and acceleration (second
+    dimension) along NED (third). The last dimension is the motion without errors, then its
+    derivative with respect to each constant. An acceleration applies until the next time.
     """
 
     time_s: Array
@@ -96,25 +94,21 @@ SignalCache = dict[Span, Signals]
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source and motion from the IMU, in segments, for any time offset.
+    """Positions of one source and motion from the IMU, in s segments, for any time offset.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Timestamps of the measurements in segments.
     measurement_m : ndarray, shape (m, a)
-        Positions along each axis relative to the segment's first position; NaN if missing.
+        Positions relative to the segment's first position; NaN if missing.
     weight : ndarray, shape (m,)
-        Weight of each measurement.
     edges : ndarray of int, shape (s + 1,)
-        Index of the first measurement of each segment; last, the number of measurements.
+        First measurement of each segment, and m.
     signals : tuple of Signals
-        Motion and sensitivities of each segment.
     directions : ndarray, shape (a, 3)
         Unit vectors of the axes in NED.
     dt_s : float
         DT, the interval for which SIGMA_A is defined.
-    imu_interval_s : float
     heading_sigma_rad : float
         Prior σ of the heading at the start of a segment.
     """
@@ -130,7 +124,7 @@ class PreparedMotion:
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, count: int) -> PreparedMotion:
-        """Keep about ``count`` measurements, or all if too few would remain in every segment."""
+        """Keep about ``count`` measurements; keep all if every segment would get too few."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
         keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
@@ -144,7 +138,7 @@ class PreparedMotion:
         return replace(self, **arrays, edges=np.cumsum([0, *counts[keeps_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
-        """Return positions and integrated IMU data for each time offset, without scale error."""
+        """Return positions and integrated IMU data for each time offset, with a known scale."""
         length_s = np.diff(self.time_s)
         noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
@@ -174,11 +168,11 @@ class PreparedMotion:
         )
 
     def at(self, offset_s: float) -> Positions:
-        """Return the positions minus a smooth path for one time offset, with unknown scale."""
+        """Return the positions for one time offset, with an unknown scale."""
         return next(self.position_batches(np.array([offset_s])))
 
     def position_batches(self, offset_s: Array, *, has_scale: bool = True) -> Iterator[Positions]:
-        """Yield positions for batches of time offsets, with an unknown scale if ``has_scale``."""
+        """Yield the positions for batches of time offsets; ``has_scale``: with an unknown scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
         batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
@@ -188,15 +182,9 @@ class PreparedMotion:
     def search_offset(
         self, noises: Noises, factors: Sequence[float] = (1.0,), *, has_scale: bool = True
     ) -> tuple[float, Noises]:
-        """Return the time offset and the noises with the maximum likelihood on a coarse grid.
+        """Return time offset and noises with the maximum likelihood on a coarse grid.
 
-        Parameters
-        ----------
-        noises : Noises
-        factors : sequence of float
-            Factors on SIGMA_A of the grid.
-        has_scale : bool
-            True if the scale of the positions is unknown.
+        ``factors`` are the tested factors on SIGMA_A; ``has_scale`` is True for an unknown scale.
         """
         offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
         sigma = noises.sigma_z_m
@@ -236,13 +224,9 @@ def prepare_motion(
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
-        Signals of this flight to reuse; new signals are added to it.
+        IMU motion of this flight that was already computed; new motion is added.
     max_segment_s : float
         Maximum length of a segment.
-
-    Returns
-    -------
-    PreparedMotion, or Unavailable without IMU or attitude or with too few measurements.
     """
     imu = flight.imu
     attitude = flight.attitude
@@ -283,8 +267,7 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # positions relative to the first one of the segment are small, which limits rounding errors;
-    # the initial position is an unknown of the fit
+    # the initial position is unknown, and small numbers limit rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
     first_m = measured_m.groupby(segment_index).transform("first")
@@ -312,7 +295,7 @@ def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signals:
-    """Compute the motion in NED from the IMU, and the sensitivity to each unknown constant."""
+    """Compute the motion in NED from the IMU, and its sensitivity to each constant."""
     time = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
@@ -356,7 +339,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
 def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
     """Integrate the gyroscopes from the logged attitude at the start of a segment.
 
-    ``angle`` is the integral of the angular rate (rad). Return quaternions body to NED, w first.
+    ``angle`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
     """
     attitude_s = attitude.index.to_numpy()
     near_rows = slice(

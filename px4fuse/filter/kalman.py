@@ -26,7 +26,7 @@ from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import make_timeline
 
 Rows = list[tuple[float, ...]]
-# Columns of the table ``Replay.updates``, which has one row per measurement
+# Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
     "innovation_m",
@@ -45,20 +45,12 @@ class Replay:
 
     Attributes
     ----------
-    axis : Axis
-    settings : Settings
     steps : DataFrame, shape (n, 7)
-        State after each prediction and its update, if any: ``position_m, velocity_m_s,
-        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``. Input of the prediction
-        step that starts at this time (0 in the last row): ``acceleration_m_s2``, and
-        ``input_variance_m2_s4``, which is added to SIGMA_A² in gaps of the IMU.
+        State, covariance, and input of the next step, after each prediction and update.
     updates : DataFrame, shape (m, 8)
-        At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx⁻),
-        ``innovation_variance_m2`` (HP⁻Hᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
-        before the update ``prior_position_m``, ``prior_position_variance_m2``,
-        ``prior_velocity_variance_m2_s2``.
+        Innovation ν = z - Hx⁻, S = HP⁻Hᵀ + R, gains and prior state at each measurement.
     input_gap_s : float
-        Time without IMU data (s), in which Q is increased by the mean square of the input.
+        Time without IMU data, in which Q is increased.
     """
 
     axis: Axis
@@ -80,10 +72,9 @@ def replay(
     axis : Axis
     settings : Settings
     initial : InitialState, optional
-        By default the position of the first measurement and velocity zero; the first measurement is
-        then not fused.
+        Default: the first measurement (which is then not fused) and velocity zero.
     fast : bool
-        True for repeated runs: floats instead of filterpy, with the same results to 1e-9.
+        True to compute with floats instead of filterpy; the results are equal to 1e-9.
 
     Raises
     ------
@@ -116,11 +107,10 @@ def replay(
 def _run_filterpy(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[Rows, Rows]:
-    """Predict and update KF with filterpy.
+    """Run KF with filterpy, and return the rows of :attr:`Replay.steps` and ``updates``.
 
-    ``inputs`` has for each step its length (s), the acceleration (m/s²), the noise density SIGMA_A²
-    · DT (m²/s³), and the measured position (m) at its end, or None. Return the rows of
-    :attr:`Replay.steps` (states and covariances) and of :attr:`Replay.updates`.
+    ``inputs`` are sequences over the steps: length (s), acceleration (m/s²), noise density SIGMA_A²
+    · DT (m²/s³), and measured position (m) or None.
     """
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
@@ -153,7 +143,7 @@ def _run_filterpy(
 def _run_floats(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[Rows, Rows]:
-    """Predict and update KF with floats; arguments and results as in :func:`_run_filterpy`."""
+    """Run KF with floats, as :func:`_run_filterpy`."""
     position, velocity, covariance = (
         initial.position_m,
         initial.velocity_m_s,
@@ -176,9 +166,9 @@ def _run_floats(
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Find KF's last prediction step before each time.
+    """Return the index of the last step before each time, the time since it (s), and a mask.
 
-    Return the index of the step, the time since the step (s), and a mask of times outside the run.
+    The mask is True for times outside of the run.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
@@ -192,10 +182,9 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
 
 
 def state_at(run: Replay, times_s: Array) -> Array:
-    """Predict position (m) and velocity (m/s) at each time from KF's last step before that time.
+    """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
-    Interpolation between two prediction steps would use a measurement before it is received. The
-    result has the shape (2, n); it is NaN outside the run.
+    Interpolation would use a measurement before it is received. NaN outside the run.
     """
     index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (

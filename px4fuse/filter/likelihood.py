@@ -34,8 +34,8 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Maximum change of the other noise's logarithm between two points of a likelihood profile, which is
-# maximised over the other noise (for example SIGMA_Z in the profile of SIGMA_A)
+# Maximum change of the other noise's logarithm (for example SIGMA_Z in the profile of SIGMA_A)
+# between two points of a likelihood profile
 MAX_OTHER_LOG_STEP = 1.0
 # Tolerance of the other noise's logarithm at each point of a likelihood profile
 OTHER_LOG_TOLERANCE = 2e-3
@@ -50,10 +50,8 @@ class Preintegrated:
     length_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
         Δp and Δv due to the acceleration.
-    noise_unit : ndarray, shape (m, 3)
-        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s².
-    noise_fixed : ndarray, shape (m, 3)
-        Elements of the additional Q in gaps of the IMU, independent of SIGMA_A.
+    noise_unit, noise_fixed : ndarray, shape (m, 3)
+        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the additional Q in gaps of the IMU.
     measurement_m : ndarray
     initial : InitialState
     """
@@ -67,7 +65,6 @@ class Preintegrated:
     initial: InitialState
 
     def first_measurements(self, count: int) -> Preintegrated:
-        """Keep only the first ``count`` measurements."""
         arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
         return replace(self, **arrays)
 
@@ -105,15 +102,7 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
 def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> ArrayPair:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements.
 
-    Parameters
-    ----------
-    timeline : Timeline
-    acceleration_m_s2 : ndarray, shape (n - 1,)
-        Acceleration of each prediction step.
-
-    Returns
-    -------
-    delta_position_m, delta_velocity_m_s : ndarray, shape (m,)
+    ``acceleration_m_s2``, shape (n - 1,), is the acceleration of each prediction step.
     """
     _, interval_index, remaining_s = _interval_index(timeline)
     zeros = np.zeros(len(remaining_s))
@@ -127,10 +116,9 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Assign the prediction steps to the intervals between measurements.
+    """Return the last step of each interval between measurements, and two values for each step.
 
-    Return the last step of each interval, and for each step the index of its interval and the time
-    (s) until the interval ends.
+    These are the index of the step's interval and the time (s) until the interval ends.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
@@ -160,25 +148,20 @@ def run_filter(
     is_skipped: BoolArray | None,
     weight: Array | None = None,
 ) -> Iterator[ArrayPair]:
-    """Run KF over a grid of settings, measurement by measurement.
+    """Run KF for a grid of settings; yield ν (m) and S (m²) of each measurement.
 
-    With one pair of settings, Δp, Δv and measurements may have k columns, shape (m, k): KF is
-    linear, so all columns (data, or the effect of an error) are filtered with the same gains.
+    With one pair of settings, Δp, Δv and the measurements may have k columns, shape (m, k). KF is
+    linear, so k inputs can be filtered with the same gains.
 
     Parameters
     ----------
     intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
-        Broadcast against each other to a grid of shape (...).
+        Broadcast against each other to a grid.
     is_skipped : ndarray of bool, shape (m,), or None
         Measurements with an innovation but without an update.
     weight : ndarray, shape (m,), optional
-        Weight of each measurement: its variance is SIGMA_Z² / weight.
-
-    Yields
-    ------
-    (ndarray, ndarray) or (float, float)
-        ν (m) and S (m²). Both have the grid's shape, or are floats for a single setting.
+        The variance of a measurement is SIGMA_Z² / weight.
     """
     squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
     q, r = np.broadcast_arrays(*squares)
@@ -216,17 +199,16 @@ def run_filter(
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
-    """List the value of each measurement: a number, or an array of k columns."""
+    """Return a list of numbers, or of arrays with k columns."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
 def score_grid(
     intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
 ) -> Array:
-    """Compute KF's -ln p of all axes (without a constant) on a grid of settings.
+    """Return KF's -ln p of all axes (without a constant) on a grid of settings.
 
-    ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other. The variance of each
-    measurement is SIGMA_Z² / weight.
+    The variance of a measurement is SIGMA_Z² / weight.
     """
     total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     for interval in intervals:
@@ -236,21 +218,10 @@ def score_grid(
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
-    """Return the vertex of the parabola through three points of a profile.
+    """Return the minimum of the parabola through a point of a profile and its two neighbours.
 
-    Parameters
-    ----------
-    profile : ndarray, shape (n,)
-        Negative log-likelihood at parameter values with equal steps.
-    index : int
-        Index of the middle point, 1 to n - 2.
-
-    Returns
-    -------
-    shift : float
-        Distance from the middle point to the minimum, in steps; 0 without a minimum.
-    curvature : float
-        Second difference of the profile at the middle point.
+    Return the distance from the point to the minimum, in steps (0 without a minimum), and the
+    second difference of the profile.
     """
     left_value, middle_value, right_value = profile[index - 1 : index + 2]
     curvature = left_value - 2.0 * middle_value + right_value
@@ -262,12 +233,8 @@ def profile_interval(
 ) -> tuple[float | None, float | None]:
     """Return the 95 % interval of a parameter; None for an end outside the grid.
 
-    Parameters
-    ----------
-    grid, profile : ndarray, shape (n,)
-        Parameter values, and negative log-likelihood at these values; interpolated linearly.
-    max_drop : float
-        Increase of the negative log-likelihood from the minimum to the ends of the interval.
+    ``profile`` is the negative log-likelihood on the grid; it increases by ``max_drop`` from its
+    minimum to the ends of the interval.
     """
     drop = profile - profile.min()
     first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
@@ -294,12 +261,12 @@ def profile_ends(
     Parameters
     ----------
     score : callable
-        Negative log-likelihood as a function of the logarithms of the parameter and of one other
-        parameter. The other parameter is optimised at each value of the parameter.
+        -ln p as a function of the logarithms of the parameter and of another parameter, over which
+        it is minimised.
     best_logs : (float, float)
-        Both logarithms at the minimum.
+        Logarithms of both parameters at the minimum.
     bounds : (float, float)
-        Bounds of the parameter (not of its logarithm).
+        Bounds of the parameter itself.
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
@@ -309,8 +276,7 @@ def profile_ends(
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
-        # the square root of the drop of the log-likelihood is nearly linear in the distance from
-        # the maximum; the search for the other parameter starts at the previous result
+        # the square root of the drop is nearly linear in the distance, which helps brentq
         @cache
         def excess(distance: float) -> float:
             nonlocal other_log

@@ -1,20 +1,20 @@
-"""Likelihood of positions along a few axes, with constant errors of each segment marginalised.
+"""Likelihood of positions along a few axes, with unknown constant errors of each segment.
 
-A segment is a part of the flight without a gap in the IMU data. Each segment has a separate initial
-state and separate unknown constants: biases and other constant errors.
+A segment is a part of the flight without a gap in the IMU data. It has its own initial state and
+its own constants (biases and other constant errors).
 
 Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
-x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement over its
-variance. The matrix A of this quadratic form has three bands below the diagonal, so LAPACK
-factorises a flight in a millisecond. The marginal likelihood of the measurements equals the
-likelihood of KF's innovations (Schweppe 1965). It follows from log|A| and the squared residuals at
-the minimum.
 
-Signals are inputs that enter linearly: the data, and the sensitivity of the data to each unknown
-constant. Each signal is a column; the factorisation does not depend on the signals. The constants
-have a prior and are marginalised by the Schur complement of the signals' inner products.
-Time-correlated noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the measurement:
-z - p - c. It is independent in each segment.
+- x_{k+1} - Fx_k - [Δp, Δv] of each interval, weighted by Q⁻¹;
+- z - p of each measurement, over its variance.
+
+The matrix A of this quadratic form has three bands below the diagonal, so LAPACK factorises a
+flight in a millisecond. log|A| and the squared residuals at the minimum give the likelihood, which
+equals that of KF's innovations (Schweppe 1965).
+
+The data, and their sensitivity to each constant, are inputs of the same linear system ("signals").
+The constants are eliminated by the Schur complement of the inner products of the signals.
+Time-correlated noise is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -33,18 +33,17 @@ from scipy.linalg import lapack
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) of the KF whose smoothed path is subtracted from the positions
+# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoothed path that is subtracted from the positions
 PATH_NOISES = 0.5, 0.1
 # Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3
-# Minimum position noise of an interval, relative to the measurement noise and to the interval's Q:
-# it makes Q invertible if Q is from a single step (rank one) or zero
-MIN_NOISE_SHARE = 1e-5
-# Number of signals that are computed together: more signals need more memory and are not faster
+# Minimum position noise (σ) that each interval adds, relative to the measurement noise and to Q: it
+# makes a singular Q invertible
+MIN_NOISE_RATIO = 1e-5
+# Number of signals per computation: more need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# Minimum determinant of Q, relative to the product of the diagonal of Q: smaller values are
-# rounding errors
-MIN_DETERMINANT_SHARE = 1e-12
+# Smaller determinants of Q, relative to the product of its diagonal, are rounding errors
+MIN_DETERMINANT_RATIO = 1e-12
 
 
 @dataclass(frozen=True)
@@ -58,19 +57,17 @@ class Positions:
     segment_starts : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
-        Intervals between successive measurements, including intervals between segments.
+        Intervals between measurements; like Δp and Δv, ignored between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of the process noise Q of each interval: for SIGMA_A = 1 m/s², and the
-        component of Q that does not depend on SIGMA_A.
+        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the Q that is added to it.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
-        Prior standard deviations of the unknown constants of each segment.
+        Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Δp and Δv of each interval, then their sensitivity to each unknown constant, for T time
-        offsets; ignored between segments.
+        Δp and Δv of each interval, then their sensitivity to each constant.
     correlated_noise : (float, float) or None
-        Standard deviation (m) and time constant (s) of the source's time-correlated noise.
+        Standard deviation (m) and time constant (s) of time-correlated noise.
     """
 
     measurement_m: Array
@@ -86,7 +83,7 @@ class Positions:
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
-        """Index of each segment's first measurement, and last index plus 1."""
+        """First measurement of each segment, and its last one plus 1."""
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
@@ -99,13 +96,8 @@ class Positions:
     ) -> tuple[Positions, Array]:
         """Return the positions with noises in units of SIGMA_Z, and the measurement variances.
 
-        Parameters
-        ----------
-        sigma_z_m : float
-        random_walk : float
-            Random walk of the source / SIGMA_Z, per √s.
-        weight : ndarray
-            Weight of each measurement, without a first measurement that is KF's initial state.
+        ``random_walk`` is the random walk of the source / SIGMA_Z (1/√s). ``weight`` may omit the
+        first measurement, which is KF's initial state and gets weight 1.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
         noise_fixed[0] += self.length_s * random_walk**2
@@ -124,10 +116,9 @@ class Positions:
     def factorised_systems(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
-        """Yield factorised normal equations, each with the axes to which they apply.
+        """Yield (axes, factorised normal equations, degrees of freedom of one axis).
 
-        Axes that are measured at the same times have the same equations. The third value is the
-        number of degrees of freedom of one axis.
+        Axes that are measured at the same times have the same equations.
         """
         is_measured = np.isfinite(self.measurement_m)
         noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
@@ -162,19 +153,15 @@ class Positions:
 
 @dataclass(frozen=True)
 class FittedPositions:
-    """Likelihood of positions in s segments with one SIGMA_A and SIGMA_Z, for T time offsets.
-
-    c is the number of unknown constants.
+    """Likelihood of positions with one SIGMA_A and SIGMA_Z, for T time offsets.
 
     Attributes
     ----------
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
-        Inner products of the data and of their sensitivities to the unknown constants, weighted
-        with the inverse covariance.
+        Inner products of the data and their sensitivities, weighted by the inverse covariance.
     log_determinant : float
     degrees_of_freedom : int
-        Number of measured positions minus the number that determines initial states. If all noises
-        are multiplied by a factor, -ln p increases by this number times ln(factor).
+        Number of measured positions minus the number that determines the initial states.
     constant_sigma : ndarray, shape (c,)
     """
 
@@ -199,7 +186,7 @@ class FittedPositions:
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment without the log-determinant, shape (k, s, T).
 
-        ``scales`` are k factors on all noises; s segments, T time offsets.
+        ``scales`` are k factors on all noises.
         """
         gram = self.gram / scales[:, None, None, None, None] ** 2
         sigma = self.constant_sigma
@@ -212,7 +199,7 @@ class FittedPositions:
         return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of all segments (without a constant) for scaled noises, shape (k, T)."""
+        """Return -ln p of all segments (without a constant), shape (k, T), with scaled noises."""
         determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
@@ -220,17 +207,10 @@ class FittedPositions:
 def fit_positions(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
 ) -> FittedPositions:
-    """Fit positions with one SIGMA_A and given measurement variances.
+    """Fit positions with one SIGMA_A; ``variance_m2``, shape (m,), are the measurement variances.
 
-    Parameters
-    ----------
-    positions : Positions
-    sigma_a_m_s2 : float
-    variance_m2 : ndarray, shape (m,)
-        Variance of each measurement.
-    measured_m : ndarray, shape (a, 1 or T, 1 + c, m), optional
-        Measured positions, then their sensitivity to each unknown constant; by default
-        ``positions.measurement_m``, which otherwise only determines the measured axes and times.
+    ``measured_m``, shape (a, 1 or T, 1 + c, m), replaces the measured positions by other data,
+    followed by their sensitivity to each constant.
     """
     if measured_m is None:
         measurement_count, axes = positions.measurement_m.shape
@@ -263,15 +243,8 @@ def fit_positions(
 def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Positions:
     """Subtract a smooth path through the positions from positions and IMU increments.
 
-    The likelihood is unchanged in theory. The rounding errors are smaller, because the likelihood
-    is no longer a small difference of large squares. The path starts at zero in each segment.
-
-    Parameters
-    ----------
-    positions : Positions
-    has_scale : bool
-        True if the last unknown constant is the scale of the positions. The path becomes the
-        sensitivity to this constant.
+    This does not change the likelihood, but its rounding errors are smaller. With ``has_scale``,
+    the path also becomes the sensitivity to the last constant, the scale of the positions.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -287,8 +260,7 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
         speed = state[..., 1]
         measured_m[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
-        # the path of the first time offset is subtracted at all offsets; the sensitivity to the
-        # scale is the path of each offset
+        # the same path, of the first time offset, is subtracted for all time offsets
         for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
             array[axes, :, 0] -= increment[:, :1]
             if has_scale:
@@ -299,7 +271,7 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
 def expected_squares(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
 ) -> ArrayPair:
-    """Return the expected square of each measurement error given all data, summed over axes.
+    """Return the expected squared error (m²) and the number of measured axes of each measurement.
 
     Parameters
     ----------
@@ -309,16 +281,10 @@ def expected_squares(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     constants : ndarray, shape (s, c)
-        Maximum-likelihood estimates of the unknown constants of each segment.
-
-    Returns
-    -------
-    square_m2 : ndarray, shape (m,)
-    count : ndarray, shape (m,)
-        Number of axes with a measurement.
+        Maximum-likelihood values of the unknown constants.
     """
     coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # an interval has the constants of the segment in which the interval ends
+    # correct Δp and Δv for the constants of the segment in which each interval ends
     interval_coefficients = np.repeat(
         coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
@@ -340,30 +306,26 @@ def products_by_segment(
     signals: Sequence[Array],
     measured_m: Array,
 ) -> Array:
-    """Return inner products of two sets of k signals in each segment, constants marginalised.
+    """Return the inner product of each of k signals with a second signal, shape (s, k).
 
     Parameters
     ----------
     positions : Positions
-        Positions with one time offset; ``measurement_m`` only determines measured axes and times.
+        Positions with one time offset.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
-        Measurements, Δp and Δv of k signals.
+        Measurements, Δp and Δv of the first signals.
     measured_m : ndarray, shape (a, k, m)
-        Measurements of the second set; its Δp and Δv are zero.
-
-    Returns
-    -------
-    ndarray, shape (s, k)
+        Measurements of the second signals, which have no Δp and Δv.
     """
     first_measured_m, *increments = signals
     constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
     results = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
         batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # columns: first set of signals, second set of signals, sensitivities to the constants
+        # order: first signals, second signals, sensitivities to the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
                 :, None
@@ -398,18 +360,17 @@ class BandedSystem:
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Precision of the measured position (1/m²), and of the prior velocity zero (s²/m²); 0
-        without a measurement or prior.
+        Precision of the measured position (1/m²) and of a prior velocity (s²/m²); 0 if unknown.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive states.
     inverse_q : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
-        1/√Q₁₁, without the rounding errors of Q⁻¹; zero between segments.
+        1/√Q₁₁; zero between segments.
     bands, lower : ndarray, shape (2 + states, states · m)
-        Bands of A and of its Cholesky factor.
+        Matrix A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
-        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p that does not depend on signals.
+        ln|A| + Σ ln|Q| - Σ ln precision.
     """
 
     precision: Array
@@ -422,27 +383,27 @@ class BandedSystem:
 
     @property
     def state_count(self) -> int:
-        """Number of states per time: position, velocity and, if any, time-correlated noise."""
+        """2 (position, velocity), or 3 with time-correlated noise."""
         return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
-        """Whiten signals, so that inner products under the inverse covariance are plain products.
+        """Whiten signals, so that their inner products are sums of plain products.
 
-        An inner product is the product of ``intervals``, minus the product of ``explained``, plus
-        the product of the measurements over their σ (zero for most signals).
+        Inner product = product of ``intervals`` - product of ``explained`` + product of the
+        measurements over their σ.
 
         Parameters
         ----------
         measured_m : ndarray, shape (..., m)
         dp, dv : ndarray, shape (..., m - 1)
-            Δp (m) and Δv (m/s) of the intervals; ignored between segments.
+            Δp (m) and Δv (m/s) of the intervals.
 
         Returns
         -------
         intervals : two ndarray, shape (..., m - 1)
-            Whitened Δp and Δv; zero between segments.
+            Whitened Δp and Δv.
         explained : ndarray, shape (..., states · m)
-            Component of the signals that is explained by the states.
+            Component of the signals that the states explain.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
         explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
@@ -455,12 +416,9 @@ class BandedSystem:
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
-        """Whiten the intervals, and compute the right-hand side of the normal equations.
-
-        The right-hand side has the shape (signals, states · m).
-        """
+        """Return the whitened intervals, and the right-hand side of the normal equations."""
         i00, i01, _ = self.inverse_q
-        # U of Q⁻¹ = UᵀU; both are zero between segments
+        # Cholesky factor U of Q⁻¹ = UᵀU
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
         whitened_0 = u00 * dp + u01 * dv
@@ -485,9 +443,8 @@ class BandedSystem:
     def position_variance(self) -> Array:
         """Return the variance of each state's position given all data (m²), shape (m,).
 
-        The information about a state is the sum of the information from all earlier and all later
-        states. Both are blocks of Cholesky factors: of A, and of A in reversed order (Fraser and
-        Potter 1969).
+        The information of earlier and of later measurements adds up. Both are blocks of Cholesky
+        factors: of A, and of A in reversed order (Fraser and Potter 1969).
         """
         # reverse the order of the rows and columns of A
         reversed_bands = np.zeros_like(self.bands)
@@ -497,7 +454,7 @@ class BandedSystem:
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c) = (self.lower[0, first_row::2] for first_row in (0, 1))
         b = self.lower[1, 0::2]
-        # in the blocks of the reversed matrix, velocity precedes position
+        # the reversed order also exchanges position and velocity
         (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
@@ -522,12 +479,11 @@ def factorise(
     noise : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q of each interval.
     is_joined : ndarray of bool, shape (m - 1,)
-        False between segments, which are independent.
+        False between segments.
     precision : ndarray, shape (m, 2)
-        Precision of the measured positions (1/m², 0 if not used), and of the prior velocity zero
-        (s²/m²).
+        See :class:`BandedSystem`; without priors if there is time-correlated noise.
     correlated_noise : (float, float), optional
-        See :class:`Positions`; ``precision`` must then not contain priors.
+        See :class:`Positions`.
 
     Raises
     ------
@@ -536,7 +492,7 @@ def factorise(
     """
     q00, q01, q11 = noise
     measured_precision = precision[:, 0]
-    min_noise = MIN_NOISE_SHARE**2 * (
+    min_noise = MIN_NOISE_RATIO**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
     # Q of a single prediction step has rank one. Rounding errors of its determinant must not hide
@@ -544,7 +500,7 @@ def factorise(
     product = q00 * q11
     raw_determinant = product - q01**2
     determinant = (
-        np.where(raw_determinant > MIN_DETERMINANT_SHARE * product, raw_determinant, 0.0)
+        np.where(raw_determinant > MIN_DETERMINANT_RATIO * product, raw_determinant, 0.0)
         + min_noise * q11
     )
     inverse_q = np.where(is_joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)

@@ -48,10 +48,10 @@ def process_noise_unit(dt_s: T) -> Symmetric[T]:
 
 
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return the process noise of many short prediction steps with the total length ``dt_s``.
+    """Return Q / (SIGMA_A² · DT) of many short prediction steps: elements 00, 01, 11.
 
-    Elements 00, 01, 11 of Q / (SIGMA_A² · DT). Compared with a single step, the position element is
-    dt³/3 instead of dt³/4, because the acceleration may change within the interval.
+    Element 00 is dt³/3 instead of dt³/4 of a single step, because the acceleration may change
+    within the interval.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -87,10 +87,7 @@ def update_step(
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
-    Returns
-    -------
-    tuple
-        ν (m), S (m²) and the two gains; then position, velocity and covariance after the update.
+    Return (ν in m, S in m², both gains), then position, velocity and covariance after the update.
     """
     p00, p01, p11 = covariance
     nu = measured_m - position

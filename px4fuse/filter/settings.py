@@ -8,7 +8,7 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Valid ranges of KF's settings: a value outside is a typing error
+# Valid ranges of KF's settings; values outside are typing errors
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
@@ -25,20 +25,20 @@ class Settings:
     Attributes
     ----------
     sigma_a_m_s2 : float
-        Process noise SIGMA_A, standard deviation of the acceleration input over one DT.
+        Process noise SIGMA_A: standard deviation of the acceleration input over one DT.
     sigma_z_m : float
         Measurement noise SIGMA_Z.
     dt_s : float
         Prediction interval DT.
     input : {"imu", "zero"}
-        Acceleration measured by the IMU, or zero: constant-velocity model.
+        "zero" is the constant-velocity model.
     clock_offset_s : float
         Time offset added to the timestamps of the position source.
 
     Raises
     ------
     SettingsError
-        A value is outside its documented range, or not a number.
+        A value is out of range or not a number.
     """
 
     sigma_a_m_s2: float = SIGMA_A_M_S2

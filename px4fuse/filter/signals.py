@@ -1,8 +1,7 @@
 """Positions and acceleration of a flight along its axes: north, east, down and aisle.
 
-The aisle is the main horizontal direction of the flight.
-
-NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
+The aisle is the main horizontal direction of the flight. Acceleration in NED = R(q) · specific
+force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
 from __future__ import annotations
@@ -23,10 +22,9 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 
 AISLE = "aisle"
-# Maximum interval (s) between IMU samples: a longer interval is a gap
+# Minimum length (s) of a gap in the IMU
 IMU_GAP_S = 0.1
-# Maximum ratio of an interval between IMU samples to the median interval: a longer interval is a
-# gap
+# An interval between IMU samples longer than this multiple of the median is a gap
 IMU_GAP_INTERVALS = 5.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -34,10 +32,9 @@ MIN_MEASUREMENTS = 3
 
 @dataclass(frozen=True)
 class Segment:
-    """Analysed part of a flight: start and end (s), and the reason for choosing it.
+    """Analysed time span (s), and the reason for choosing it.
 
-    ``flight_s`` is the time span (s) from take-off to landing, or as the user chose it, including
-    times without positions. None if it equals start and end.
+    ``flight_s`` is the whole flight, including times without positions; None if it is the same.
     """
 
     start_s: float
@@ -47,7 +44,7 @@ class Segment:
 
     @property
     def flight(self) -> Segment:
-        """Segment extended to ``flight_s``, which includes times without positions."""
+        """Segment extended to the whole flight."""
         return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
@@ -64,16 +61,15 @@ class Acceleration:
     ----------
     time_s : ndarray, shape (n,)
     ned_m_s2 : ndarray, shape (n, 3)
-        Acceleration without gravity, for the whole flight; shared by all axes.
+        Acceleration without gravity, for the whole flight.
     direction : ndarray, shape (3,)
-        Unit vector in NED.
+        Unit vector of the axis in NED.
     integral_m_s : ndarray, shape (n,)
-        Integral along the axis (trapezoidal, from the first sample); differences give the mean
-        acceleration of a prediction step.
+        Integral of the acceleration along the axis from the first sample.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Start and end times of the IMU gaps and of the IMU data; total gap length until each time.
+        Start and end of each IMU gap, and total length of the gaps until then.
     rms_m_s2 : float
-        Root mean square of the acceleration: standard deviation of the input in a gap.
+        RMS of the acceleration in the segment, which is the σ of the input in a gap.
     """
 
     time_s: Array
@@ -93,16 +89,14 @@ class Axis:
 
     Attributes
     ----------
-    name : str
-        "north", "east", "down" or "aisle" (main horizontal direction of the flight).
+    name : {"north", "east", "down", "aisle"}
     direction : ndarray, shape (3,)
         Unit vector in NED.
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Source of the heading of the axis "aisle"; empty for other axes.
+        Origin of the heading of the aisle, for the user.
     measurement_time_s, measurement_m : ndarray, shape (n,)
-        Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
         Input of KF.
     """
@@ -119,12 +113,12 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """Name of the axis in messages: "the main axis" for "aisle", else ``name``."""
+        """Name of the axis in messages: "the main axis" for "aisle"."""
         return "the main axis" if self.name == AISLE else self.name
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
-    """Return the IMU samples for which the attitude is known, and the attitude."""
+    """Return the IMU samples with a known attitude, and the attitude."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
         return imu
@@ -141,14 +135,10 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
-    """Return the acceleration in NED without gravity, at the IMU's timestamps.
+    """Return the acceleration in NED without gravity (m/s²), at the IMU's timestamps.
 
-    Logs with PX4's default profile contain the attitude at a tenth of the IMU's rate, so the
-    attitude is interpolated (slerp, Shoemake 1985).
-
-    Returns
-    -------
-    DataFrame, shape (n, 3), m/s², or Unavailable
+    The attitude is interpolated (slerp, Shoemake 1985): PX4's default profile logs it at a tenth of
+    the IMU's rate.
     """
     if isinstance(recorded := imu_and_attitude(flight), Unavailable):
         return recorded
@@ -162,15 +152,14 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
 
 
 def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
-    """Return the heading of the main horizontal direction of the track.
+    """Return the main horizontal direction of the track.
 
     Returns
     -------
     heading_deg : float
-        Heading in [0, 180): both directions along an aisle are equivalent.
+        0 to 180: both directions along an aisle are equivalent.
     elongation : float
-        Ratio of the standard deviations along and across this direction; 1 without a main
-        direction.
+        Standard deviation along this direction ÷ standard deviation across it.
     """
     position_m = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred_m = position_m - position_m.mean(axis=0)
@@ -205,7 +194,7 @@ def make_axes(
     Raises
     ------
     MissingDataError
-        The source has no finite samples along a requested axis, or along any axis.
+        The source has no positions along a requested axis, or along any axis.
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
@@ -253,7 +242,7 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
 
 
 def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Return the weighted sum of columns of a table; columns with weight zero may be NaN."""
+    """Return the weighted sum of columns; columns with weight zero may be NaN."""
     total = np.zeros(len(samples))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
@@ -272,7 +261,7 @@ def _axis_direction(
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
     else:
         axis_heading_deg = heading_deg
-        note = "heading of the option --heading"
+        note = "heading chosen with --heading"
     angle_rad = np.radians(axis_heading_deg)
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
 
@@ -280,10 +269,7 @@ def _axis_direction(
 def project_acceleration(
     acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Project the acceleration (m/s², NED) onto a direction.
-
-    The root mean square is over the segment.
-    """
+    """Project the acceleration (m/s², NED) onto a direction."""
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
@@ -318,19 +304,9 @@ def imu_gaps(time_s: Array) -> BoolArray:
 
 
 def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
-    """Return the mean acceleration over each prediction step, and its fraction in an IMU gap.
+    """Return the mean acceleration of each prediction step, and the fraction of it in an IMU gap.
 
-    Parameters
-    ----------
-    acceleration : Acceleration
-    edges : array_like, shape (n + 1,)
-        Strictly increasing start and end times (s) of the prediction steps.
-
-    Returns
-    -------
-    mean_m_s2 : ndarray, shape (n,)
-    gap_fraction : ndarray, shape (n,)
-        1 outside the time span of the IMU, where the mean is 0.
+    ``edges`` are the start and end times (s) of the steps.
     """
     edges = np.asarray(edges, dtype=np.float64)
     length_s = np.diff(edges)

@@ -10,23 +10,22 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight.model import Unavailable
 
-# Maximum difference (s) between two timestamps that are treated as equal: timestamps have a
-# resolution of 1 µs
+# Timestamps with a smaller difference (s) are equal: their resolution is 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Prediction steps of KF: times of the DT grid and of the measurements, and inputs.
+    """Prediction steps of KF, with their inputs.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Strictly increasing times; the first is the time of the initial state.
+        Time of the initial state, then end of each step.
     measurement_index : ndarray of int, shape (n,)
         Index of the measurement at each time; -1 without a measurement.
     acceleration_m_s2 : ndarray, shape (n - 1,)
-        Mean acceleration over each prediction step.
+        Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
         Variance that is added to SIGMA_A² in gaps of the IMU.
     input_gap_s : float

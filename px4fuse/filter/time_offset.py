@@ -1,15 +1,12 @@
 """Time offset between position source and IMU, by joint maximum likelihood.
 
-Positions with timestamps that are wrong by a time offset τ lag or lead the measured acceleration.
-KF follows the positions, so innovations hardly grow with τ. Only the comparison of positions and
-acceleration shows the offset. So the likelihood of the positions given the acceleration is
-maximised over τ, and at every τ over the noises. Constant errors that could be confused with τ
-(biases, tilt, scale; see :mod:`px4fuse.filter.imu_motion`) are marginalised.
+KF follows late positions, so a time offset τ hardly increases the innovations. Only the comparison
+of positions with the acceleration shows it. The likelihood of the positions given the acceleration
+is maximised over τ and over the noises. Constant errors with a similar effect (biases, tilt, scale;
+:mod:`px4fuse.filter.imu_motion`) are estimated too.
 
-The noise of the IMU looks like motion that the positions do not contain, and τ shifts this noise,
-too. The noise does not bias the estimate of τ, but increases its variance above the value from the
-curvature of the likelihood. The ratio of both variances is simulated and widens the interval
-(sandwich estimate, White 1982).
+The noise of the IMU increases the variance of τ above the value from the curvature of the
+likelihood. The factor is simulated and widens the interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -21,8 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Share, Span
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
 from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
@@ -41,32 +37,31 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets at which the likelihood is computed near its maximum
 FINE_OFFSETS = 11
-# Number of time offsets of the reported likelihood curve, interpolated between the FINE_OFFSETS
+# Number of time offsets of the interpolated likelihood curve
 CURVE_OFFSETS = 121
-# Prior σ (rad) of EKF2's heading with GNSS: wide, because with a GNSS delay that is wrong by 0.2 s
-# EKF2 rotates its heading by 5° to fit the positions, and a narrow prior would hide the offset
+# Prior σ (rad) of EKF2's heading with GNSS: wide, because a GNSS delay that is wrong by 0.2 s
+# rotates EKF2's heading by 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
-# Maximum half-width (s) of the 95 % interval for accepting a time offset
+# The time offset is accepted if the half-width (s) of its 95 % interval is below this limit
 MAX_HALF_INTERVAL_S = 0.15
-# Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
-# test for a change of the offset
+# Parts of the flight with a larger σ (s) of the time offset are ignored in the test for a change
 MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of the hypothesis "constant time offset" for reporting a change in flight
+# The time offset changes in flight if the p-value of "constant" is below this limit
 MAX_CHANGE_P = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_CHANGE_S = 0.10
 # Minimum time offset, in σ, to be significant: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
-# Minimum time offset (s) to be significant: at 1 m/s a third of the noise of good UWB (0.1 m)
+# Minimum time offset (s) to be significant: a position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
-# Number of simulations of the IMU noise, to estimate the variance of the time offset
+# Number of simulations of the IMU noise for the variance of the time offset
 SIMULATION_COUNT = 96
 # Step of ln σ for numerical derivatives of the likelihood with respect to the noises
 LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
-    """Time offset in one part of the flight: start, end, offset and σ of the offset, all in s."""
+    """Time offset in one part of the flight."""
 
     start_s: float
     end_s: float
@@ -74,32 +69,29 @@ class PartOffset(Record, frozen=True):
     sigma_s: NotNegative
 
 
-class Clock(Record, frozen=True, kw_only=True):
+class ClockOffset(Record, frozen=True, kw_only=True):
     """Time offset to add to the logged timestamps of the position source.
 
     Attributes
     ----------
     offset_s : float
-        Maximum-likelihood estimate, including ``applied_s``; negative if the timestamps are late.
+        Maximum-likelihood estimate; negative if the timestamps are late.
     interval_s : (float, float)
-        95 % profile-likelihood interval, widened for the noise of the IMU.
-    sigma_s : float
-        Standard deviation from the curvature at the maximum, widened for the noise of the IMU.
+        95 % interval.
     applied_s : float
-        Offset already added to the timestamps.
+        Part of ``offset_s`` that was already added to the timestamps.
     is_determinable : bool
-        True if the 95 % interval ends inside the search range and is narrow enough.
-    reason : str
-        Reason why the offset is not determinable; empty if determinable.
+        True if the 95 % interval is narrow; ``reason`` is then empty.
     parts : tuple of PartOffset
         Offsets of consecutive parts of the flight.
     drift_ppm, drift_sigma_ppm : float or None
-        Drift of the source's clock relative to the autopilot's; None with fewer than three parts.
+        Drift of the source's clock; None with fewer than three parts.
     change_p_value : float or None
-        p-value of the hypothesis that the offset is constant (likelihood ratio test); None with
-        fewer than two parts.
-    count : int
-        Number of measurements.
+        p-value of a constant offset (likelihood ratio test); None with one part.
+    curve_s, curve_drop : ndarray, shape (n,)
+        Time offsets (s), and the decrease of the log-likelihood from its maximum.
+    sigma_a_m_s2, sigma_z_m : float
+        Noises at the maximum of the likelihood.
     """
 
     offset_s: float
@@ -113,47 +105,29 @@ class Clock(Record, frozen=True, kw_only=True):
     change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
+    curve_s: NotWritten[Array] = NOT_WRITTEN
+    curve_drop: NotWritten[Array] = NOT_WRITTEN
+    sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
+    sigma_z_m: NotWritten[float] = NOT_WRITTEN
 
     @property
     def remaining_s(self) -> float:
-        """Offset (s) still to be added to the timestamps: estimate minus applied offset."""
+        """Offset (s) still to be added to the timestamps."""
         return self.offset_s - self.applied_s
 
     @property
     def three_sigma_s(self) -> float:
-        """Minimum significant offset: ``MIN_OFFSET_SIGMAS`` standard deviations (s)."""
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     @property
     def changes(self) -> bool:
-        """True if the offset changes in flight: significantly, and by ``MIN_CHANGE_S``."""
+        """True if the offset changes in flight, significantly and by at least ``MIN_CHANGE_S``."""
         if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S
 
     def is_significant(self, offset_s: float) -> bool:
-        """Return True if an offset is larger than the error of the estimate and MIN_OFFSET_S."""
         return abs(offset_s) > max(MIN_OFFSET_S, self.three_sigma_s)
-
-
-class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
-    """Time offset of the position source, with the likelihood curve.
-
-    Attributes
-    ----------
-    curve_s, curve_drop : ndarray, shape (n,)
-        Time offsets (s), and at each offset the maximum log-likelihood minus the log-likelihood.
-    sigma_a_m_s2, sigma_z_m : float
-        Noises at the maximum of the likelihood.
-    """
-
-    schema_type = Clock
-    curve_s: Array
-    curve_drop: Array
-    sigma_a_m_s2: float
-    sigma_z_m: float
-
-    __repr__ = one_line_repr
 
 
 def estimate_time_offset(
@@ -172,23 +146,17 @@ def estimate_time_offset(
     ----------
     flight : Flight
     track : PositionTrack
-        Track with the logged timestamps.
     segment : Segment
     settings : Settings
-        Only ``clock_offset_s`` and ``dt_s`` (the interval for which SIGMA_A is defined) are used.
+        ``clock_offset_s`` is the offset that was already added.
     noises : Noises
-        Initial values for a model with biases. The random walk is not zero if the source may drift
-        (odometry).
+        Initial values; the random walk is not zero if the source may drift (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
-
-    Returns
-    -------
-    ClockOffset, or Unavailable without IMU or attitude or with too few measurements.
+        IMU motion that several estimates share.
     """
     # the height of GNSS is not used: it is noisier, and all axes share one SIGMA_Z
     axes = 2 if track.origin.is_gnss else 3
@@ -234,7 +202,7 @@ def estimate_time_offset(
             break
         half_width_s *= 2.0
     offset_s = _minimum_and_sigma(curve_s, scores)[0]
-    # an IMU sample is the mean over an interval, and its timestamp may be anywhere in this interval
+    # an IMU sample is a mean, and its timestamp may be anywhere in the averaged interval
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
@@ -273,7 +241,6 @@ def estimate_time_offset(
 
 
 def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
-    """Return equally spaced time offsets around ``centre_s``, within the search range."""
     low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), count)
 
@@ -281,10 +248,9 @@ def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
 def _profile_over_noises(
     prepared_motion: PreparedMotion, offsets_s: Array, noises: Noises, best_offset_s: float
 ) -> Array:
-    """Compute -ln p at time offsets, minimised over the noises at each offset by a Newton step.
+    """Return -ln p at time offsets, minimised over the noises by one Newton step.
 
-    The gradient is evaluated at each offset; the Hessian hardly changes and is evaluated at
-    ``best_offset_s`` only.
+    The Hessian hardly changes, so it is computed at ``best_offset_s`` only.
     """
     sigma_z = noises.sigma_z_m
     sigma_a = noises.sigma_a_m_s2
@@ -323,11 +289,11 @@ def _profile_over_noises(
 def _simulate_variance_factor(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
 ) -> float:
-    """Return the simulated variance of the time offset over its variance from the curvature.
+    """Return the simulated variance of the time offset ÷ its variance from the curvature.
 
-    The score of τ is eᵀM(v + n): e are the residuals, v the velocity, n the velocity noise of the
-    IMU, and M the inverse covariance with constant errors marginalised. The term eᵀMn is random
-    even without motion, because e contains the same noise n.
+    The derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
+    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn is random even at rest,
+    because e contains the same noise n.
     """
     positions = prepared_motion.at(offset_s)
     is_joined = positions.is_joined
@@ -366,7 +332,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Find the minimum of a profile by a parabola; return position, and σ from the curvature."""
+    """Return the minimum of a profile, found by a parabola, and σ from the curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -404,7 +370,7 @@ def _offset_per_part(
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Fit the drift of the source's clock to the offsets of the parts: drift and σ (ppm)."""
+    """Return the drift of the source's clock and its σ (ppm), from the offsets of the parts."""
     if len(part_offsets) < 3:
         return None, None
     rows = [

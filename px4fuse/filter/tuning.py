@@ -1,9 +1,8 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals and a held-out check.
 
-Constant errors are not noise. With IMU data, biases, tilt and time offset are therefore also fitted
-(:mod:`px4fuse.filter.imu_motion`). SIGMA_A is then the noise of the acceleration alone, and SIGMA_Z
-the noise of the position source. KF has no states for biases and needs a larger SIGMA_A, which is
-estimated separately.
+Constant errors are not noise, so biases, tilt and time offset are estimated too
+(:mod:`px4fuse.filter.imu_motion`). SIGMA_A is then the noise of the acceleration alone. KF has no
+states for biases and needs a larger SIGMA_A, which is estimated separately.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -50,25 +48,19 @@ MAP_HALF_WIDTH_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
 MAX_OUTLIER_SHARE = 0.3
-# Factors on KF's SIGMA_A that give initial values for the fit with biases
+# Factors on KF's SIGMA_A for the initial values of the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio between an estimate and an end of the search range, for reporting the end as a bound
-# instead of the estimate
+# An estimate nearer than this factor to an end of the search range is replaced by a bound
 MAX_SEARCH_END_RATIO = 1.001
 
 
 class Noise(Record, frozen=True):
-    """Maximum-likelihood estimate of one noise parameter.
+    """Maximum-likelihood estimate of one noise parameter, with its 95 % interval.
 
-    Attributes
-    ----------
-    value : float or None
-        Estimate; None if the likelihood has its maximum at zero or beyond the search range.
-    low, high : float or None
-        Ends of the 95 % profile-likelihood interval. ``low`` is None if the parameter may be zero;
-        ``high`` is None if the likelihood gives no upper bound.
+    ``value`` is None if the maximum is outside the search range, ``low`` if the noise may be zero,
+    and ``high`` without an upper bound.
     """
 
     value: float | None
@@ -77,29 +69,26 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Make a noise from estimate and interval as stored in :class:`NoiseEstimate`."""
+        """Make a noise from the fields of :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """Return value and interval as fields of :class:`NoiseEstimate`."""
+        """Return value and interval as fields of :class:`AxisTuning`."""
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
 
 
 class HeldOutCheck(Record, frozen=True):
-    """Held-out check: noises from the first half of the flight, tested with the second half.
+    """Noises estimated from the first half of the flight and tested with the second half.
 
     Attributes
     ----------
-    sigma_a_m_s2, sigma_z_m : float
-        Estimates from the first half.
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood per measurement of the second half with the estimates, minus that with the
-        chosen settings. Positive if tuning also improves data that were not used for it.
+        Gain over the chosen settings; positive if tuning improves data not used for it.
     """
 
     sigma_a_m_s2: NotNegative
@@ -108,32 +97,29 @@ class HeldOutCheck(Record, frozen=True):
     log_likelihood_gain_per_measurement: float
 
 
-class NoiseEstimate(Record, frozen=True, kw_only=True):
-    """Estimated noises of one axis, or of both horizontal axes together, with 95 % intervals.
+class AxisTuning(Record, frozen=True, kw_only=True):
+    """Estimated noises of one axis, or of north and east together, with 95 % intervals.
 
-    A value is None if the likelihood has its maximum at an end of the search range; the interval
-    then gives the bound. The lower end of an interval is 0 if the noise may be zero. The upper end
-    is None without an upper bound.
+    For missing values see :class:`Noise`; ``low`` = None is stored as 0.
 
     Attributes
     ----------
-    sigma_a_m_s2, sigma_z_m : float or None
-        Noise without the effect of biases and tilt, if the IMU data are sufficient to fit biases
-        and tilt.
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A that KF needs with ``sigma_z_m``; larger, because KF has no states for biases.
+        SIGMA_A that KF needs, because it has no states for biases.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood of KF per measurement with ``sigma_a_two_state`` and ``sigma_z``, minus that
-        with the chosen settings.
+        Gain of the estimates over the chosen settings of KF.
     before, after : Consistency or Unavailable
-        Consistency of KF with the chosen and with the estimated settings, without outliers. With
-        several axes, only along the first.
-    count, outliers : int
-        Number of measurements, and of measurements with an outlier probability above 0.5.
-    held_out : HeldOutCheck or Unavailable
+        Consistency of KF with the chosen and the estimated settings, along the first axis.
+    outliers : int
+        Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
-        True if biases and tilt were fitted. False if the IMU rate is too low; KF's SIGMA_A is then
-        an upper bound of the noise.
+        False if the IMU rate is too low; KF's SIGMA_A is then an upper bound of the noise.
+    name : str
+        Axis name, or "horizontal".
+    outlier_time_s : ndarray, shape (k,)
+        Timestamps of the outliers.
+    noises : Noises
+        Maximum-likelihood noises, including the random walk of a drifting source.
     """
 
     sigma_a_m_s2: NotNegative | None = None
@@ -149,6 +135,9 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     outliers: Count
     held_out: OrUnavailable[HeldOutCheck]
     biases_fitted: bool
+    name: NotWritten[str] = NOT_WRITTEN
+    outlier_time_s: NotWritten[Array] = NOT_WRITTEN
+    noises: NotWritten[Noises] = NOT_WRITTEN
 
     @property
     def sigma_a(self) -> Noise:
@@ -157,34 +146,12 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_a_two_state(self) -> Noise:
-        """SIGMA_A that KF needs, because it has no states for biases (m/s²)."""
+        """SIGMA_A of KF, which has no states for biases (m/s²)."""
         return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
-        """Measurement noise SIGMA_Z (m)."""
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
-
-
-class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False):
-    """Estimated noises of one axis, or of both horizontal axes, with outliers.
-
-    Attributes
-    ----------
-    name : str
-        Axis name, or "horizontal".
-    outlier_time_s : ndarray, shape (k,)
-        Timestamps of the outliers.
-    noises : Noises
-        Maximum-likelihood noises, including the random walk of a drifting source.
-    """
-
-    schema_type = NoiseEstimate
-    name: str
-    outlier_time_s: Array
-    noises: Noises
-
-    __repr__ = one_line_repr
 
 
 def tune(
@@ -202,7 +169,7 @@ def tune(
     ----------
     axes : tuple of Axis
     settings : Settings
-        ``dt_s`` and ``input`` are used; SIGMA_A and SIGMA_Z are compared with the estimates.
+        Settings of KF, which are compared with the estimates.
     names : tuple of str, optional
         Axis names and "horizontal"; default: all.
     progress : callable
@@ -212,11 +179,7 @@ def tune(
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
-
-    Returns
-    -------
-    mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+        IMU motion that several estimates share.
     """
     groups: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
     if {"north", "east"} <= groups.keys():
@@ -242,22 +205,7 @@ def tune_axes(
     drifts: bool = False,
     signals: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Estimate the noises that several axes share.
-
-    Parameters
-    ----------
-    name : str
-    axes : tuple of Axis
-        Axes with the same measurement times.
-    settings : Settings
-        ``dt_s`` and ``input`` are used; SIGMA_A and SIGMA_Z are compared with the estimates.
-    flight : Flight, optional
-        Flight whose IMU data separate biases and tilt from noise.
-    drifts : bool
-        True if the source may drift, as odometry does.
-    signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
-    """
+    """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
     intervals = [preintegrate(axis, settings) for axis in axes]
     count = len(intervals[0].measurement_m)
     if count < MIN_MEASUREMENTS:
@@ -269,7 +217,7 @@ def tune_axes(
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF starts at the first measurement, so the fit of KF has no weight for that measurement
+        # KF's fit has no weight for the first measurement, its initial state
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
         time_s = axes[0].measurement_time_s
@@ -331,7 +279,7 @@ def tune_axes(
 
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
-    """Estimate SIGMA_A (index 0) or SIGMA_Z (index 1) with its 95 % profile-likelihood interval."""
+    """Estimate SIGMA_A (index 0) or SIGMA_Z (index 1) with its 95 % interval."""
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
@@ -350,8 +298,6 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
-    """Estimate KF's SIGMA_A for a given SIGMA_Z, with a 95 % interval."""
-
     def score(log_a: float, _: float = 0.0) -> float:
         return fit.score(Noises(float(np.exp(log_a)), sigma_z))
 
@@ -366,7 +312,6 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    """Add the 95 % interval to a noise; omit a value at an end of the search range."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
@@ -398,9 +343,9 @@ def log_likelihood_drop(
     sigma_a_m_s2: Array,
     sigma_z_m: Array,
 ) -> Array:
-    """Return KF's log-likelihood below its maximum on a grid; rows: SIGMA_A, columns: SIGMA_Z.
+    """Return the decrease of KF's log-likelihood from its maximum on a grid.
 
-    Only those ``axes`` are used for which the noises were estimated.
+    Rows are SIGMA_A, columns SIGMA_Z.
     """
     names = ("north", "east") if tuning.name == HORIZONTAL else (tuning.name,)
     tuned_axes = [axis for axis in axes if axis.name in names]
@@ -421,7 +366,6 @@ def _assess_innovations(
 def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Estimate the noises from the first half of the measurements, and test them on the rest."""
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -436,7 +380,7 @@ def _check_held_out(
     ]
     first_fit = maximise_likelihood(first_half, fit.noises, fit.weight[:half_count], outliers=False)
     tuned_noises = first_fit.noises
-    # -ln p of the second half given the first: -ln p of all minus -ln p of the first half
+    # -ln p of the second half
     scores = [
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
     ]

@@ -78,12 +78,7 @@ DETECTORS = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Return the findings, most severe first, each cause followed by its consequences.
-
-    The findings of a flight that is an assignment are withheld.
-    """
-    if analysis.flight.log.is_assessed:
-        return ()
+    """Return the findings, most severe first, each cause followed by its consequences."""
     findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 

@@ -1,7 +1,7 @@
-"""Aiding sources and parameters of EKF2: PX4 names by role, defaults, units and ranges.
+"""Aiding sources of EKF2, and EKF2 parameters with PX4's defaults, units and ranges.
 
-``ekf2_parameters.toml`` has one entry per aiding source and per parameter. Other modules get the
-names of the parameters of external vision and GNSS from the aiding source (``EV_POS.noise``).
+The data are in ``ekf2_parameters.toml``. Parameter names of an aiding source are its attributes,
+for example ``EV_POS.noise``.
 """
 
 import math
@@ -17,56 +17,39 @@ from px4fuse.errors import SettingsError, suggest_name
 
 @dataclass(frozen=True)
 class Aid:
-    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, with its parameters.
+    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, and its PX4 parameters."""
 
-    Attributes
-    ----------
-    name : str
-        PX4's name, as in ``estimator_aid_src_<name>``.
-    switch : str
-        Name of the parameter that enables fusion, from PX4 v1.14 on; before, EKF2_AID_MASK does.
-    noise, gate : str
-        Names of the parameters for measurement noise (σ) and gate (√S).
-    delay : str
-        Name of the parameter for the age (ms) of positions and heights; else empty.
-    noise_mode : str
-        Name of the parameter that, if 1, makes EKF2 ignore reported variances; else empty.
-    lever_arm : tuple of str
-        Names of the parameters for the position of the sensor (m, FRD).
-    label, unit : str
-        Name for users, and unit of the innovations.
-    noise_origin : str
-        Origin of the measurement variance if it is not ``noise`` alone; else empty.
-    default_gate : float
-        Gate (√S) if the log does not contain the parameter ``gate``.
-    axes : tuple of str
-        Axes of the innovations, in PX4's order.
-    fields : tuple of str
-        Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without these fields.
-    old_fields : tuple of str
-        Fields of ``ekf2_innovations`` (v1.8 to v1.10); ``_var`` is appended for the variance.
-    flags : tuple of tuple of str
-        Groups of fields of ``estimator_status_flags``. EKF2 is configured to fuse the aiding source
-        if a flag is set in the first group that the log contains.
-    status_bit : int or None
-        Bit of ``estimator_status.control_mode_flags`` with the same meaning as ``flags``.
-    """
-
+    # Name in PX4, as in ``estimator_aid_src_<name>``
     name: str
+    # Parameter that enables fusion from PX4 v1.14 on; EKF2_AID_MASK in older releases
     switch: str = ""
+    # Parameters for the measurement noise (σ) and the innovation gate (√S)
     noise: str = ""
     gate: str = ""
+    # Parameter for the age (ms) of a measurement at its timestamp
     delay: str = ""
+    # Parameter that makes EKF2 ignore reported variances if it is 1
     noise_mode: str = ""
+    # Parameters for the position of the sensor (m, FRD)
     lever_arm: tuple[str, ...] = ()
+    # Name for users
     label: str = ""
+    # Unit of the innovations
     unit: str = "m"
+    # Origin of the measurement variance, if it is not ``noise`` alone
     noise_origin: str = ""
+    # Gate (√S) for logs without the parameter ``gate``
     default_gate: float = 5.0
+    # Axes of the innovations, in the order of PX4
     axes: tuple[str, ...] = ()
+    # Fields of the topics estimator_innovations and estimator_innovation_variances, by axis
     fields: tuple[str, ...] = ()
+    # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
     old_fields: tuple[str, ...] = ()
+    # Groups of flags in estimator_status_flags. In the first group that the log contains, any flag
+    # shows that EKF2 is configured to fuse this source
     flags: tuple[tuple[str, ...], ...] = ()
+    # Bit of estimator_status.control_mode_flags with the same meaning as ``flags``
     status_bit: int | None = None
 
     @property
@@ -142,14 +125,9 @@ REPORTED_PARAMETERS: tuple[str, ...] = tuple(TABLES["reported"].split())
 def effective_settings(
     logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
-    """Return the parameter values of the EKF2 model: the logged value, else PX4's default.
+    """Return the values of the EKF2 parameters in the model: logged value, else PX4's default.
 
-    Parameters
-    ----------
-    logged_values : mapping
-        Parameter values in the log, by PX4 name.
-    aid, *other_aids : Aid
-        Aiding sources that EKF2 fuses; parameters of other aiding sources are omitted.
+    Parameters of aiding sources that are not given are omitted.
     """
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
@@ -180,14 +158,9 @@ def fuses_by_mask(logged_values: Mapping[str, float]) -> bool:
 def replace_invalid_parameters(
     logged_values: Mapping[str, float],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Replace logged parameters that are not finite or outside PX4's range by their defaults.
+    """Replace invalid logged parameters by their defaults, and return one sentence for each.
 
-    Returns
-    -------
-    valid : dict
-        All parameters, except non-finite ones whose default is not in ``PARAMETER_RANGES``.
-    notes : tuple of str
-        One sentence per parameter that was replaced or omitted.
+    Parameters without a known default are omitted.
 
     Examples
     --------
@@ -206,7 +179,7 @@ def replace_invalid_parameters(
         if not fault:
             valid[name] = value
         elif parameter is None:
-            notes.append(f"{fault} and is not used.")
+            notes.append(f"{fault}; the parameter is not used.")
         else:
             valid[name] = defaults[name]
             notes.append(f"{fault}; the default {valid[name]:g} is used.")
@@ -214,7 +187,7 @@ def replace_invalid_parameters(
 
 
 def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
-    """Return changes of EKF2 parameters if the EKF2 model contains all of them.
+    """Check changes of EKF2 parameters.
 
     Raises
     ------

@@ -11,9 +11,9 @@ from px4fuse.core.record import Count, NotNegative, Record, Sha256, Share, Unava
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 
 SHARED_STAMPS = "most timestamps are repeated"
-# Name of the clock of timestamps that PX4 converted from the sender's clock, or replaced
+# Name of the clock of timestamps that PX4 set: converted from the sender's clock, or arrival time
 SENDER_CLOCK = "sender timestamps"
-# Used in place of each estimate, re-run and diagnosis of a flight that is an assignment
+# Replaces all estimates, re-runs and findings of a flight that is an assignment
 WITHHELD = Unavailable(
     "diagnosis",
     "the flight is an assignment, so px4fuse withholds its diagnosis",
@@ -55,39 +55,27 @@ class Sender(Record, frozen=True):
 
 
 class ClockMap(Record, frozen=True):
-    """Conversion of the timestamps of a clock to the autopilot's boot clock.
+    """Linear conversion of a clock to the autopilot's boot clock.
 
     boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
-
-    Attributes
-    ----------
-    clock : str
-        Name of the clock ("UNIX time of system 1, component 197").
-    method : str
-        Data from which the conversion is estimated: "boot clock", "TIMESYNC", "SYSTEM_TIME",
-        "receive time", "arrival time" or "position in the stream".
-    pairs : int
-        Number of simultaneous readings of both clocks.
-    offset_s : float
-        Boot clock minus this clock, at the middle of the readings.
-    drift_ppm : float
-        Rate of the boot clock minus rate of this clock (parts per million).
-    jitter_s : float
-        Standard deviation of the readings from the fitted line (1.4826 · median absolute
-        deviation).
-    note : str
-        Limitation of the conversion; may be empty.
-    distinct_stamps : int or None
-        Number of different timestamps, if the timestamps are not usable as a clock.
     """
 
+    # Name of the clock ("UNIX time of system 1, component 197")
     clock: str
+    # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival
+    # time" or "position in the stream"
     method: str
+    # Number of simultaneous readings of both clocks
     pairs: Count
+    # Boot clock minus this clock, at the middle of the readings
     offset_s: float
+    # Rate of the boot clock minus rate of this clock
     drift_ppm: float
+    # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
     jitter_s: NotNegative
+    # Limitation of the conversion, if any
     note: str = ""
+    # Number of different timestamps, only if too few for a conversion
     distinct_stamps: Count | None = None
 
 
@@ -119,83 +107,49 @@ class InputFile(Record, frozen=True):
 
 
 class LogInfo(Record, frozen=True, omit_defaults=False):
-    """Description of the log file.
+    """Description of the log file; "unknown" for texts that are not in the log."""
 
-    Attributes
-    ----------
-    name : str
-        File name without folder.
-    sha256 : str
-        SHA-256 of the file content.
-    bytes : int
-        Size of the file.
-    format : str
-        "ULog", "MAVLink tlog" (with receive times) or "MAVLink stream" (without).
-    firmware : str
-        Version, for example "PX4 v1.16.1"; "unknown" if not in the log.
-    firmware_hash : str
-        Git hash of the firmware; "unknown" if not in the log.
-    hardware : str
-    boot_time_s : float
-        Boot clock (s) at time zero of the flight, which is the first sample.
-    duration_s : float
-        Duration of the data. ULog: duration of the IMU samples, else of the topic with the most
-        samples. MAVLink: duration of the messages with boot time. Outliers of time are ignored.
-    dropouts : tuple of Dropout
-        Dropouts that the logger reported.
-    parameters : mapping
-        PX4 parameters for fusion and logging at the start of the log, by name.
-    parameter_defaults : mapping
-        Logged firmware defaults of the EKF2 parameters whose values are changed; ULog only.
-    notes : tuple of str
-        Sentences about dropped samples and clocks.
-    damage : tuple of str
-        Sentences about damaged bytes of the file.
-    bytes_read : int
-        Number of bytes that were read as complete messages.
-    ends_in_flight : bool
-        True if the land detector reports flight at the end of the data.
-    restarts : int or None
-        Number of restarts of the boot clock; if any, only the data between two restarts are used.
-    receive_time_reversals : int or None
-        Number of backward jumps of the recording computer's clock.
-    dropped : mapping
-        Number of samples with invalid timestamps, by topic, message or file.
-    autopilot : str
-        "PX4", "ArduPilot", or the name in the log.
-    start_unix_s : float or None
-        UNIX time at time zero of the flight; None if not in the log.
-    senders : tuple of Sender
-        Senders of a MAVLink recording, most messages first.
-    vehicle : str
-        Hexadecimal identifier of the flight controller; empty if not in the log.
-    is_assessed : True or UNSET
-        True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis.
-    """
-
+    # File name without folder
     name: str
     sha256: Sha256
     bytes: Count
+    # A "MAVLink tlog" contains receive times, a "MAVLink stream" does not
     format: Literal["ULog", "MAVLink tlog", "MAVLink stream"]
     firmware: str
     firmware_hash: str
     hardware: str
+    # Boot clock at time zero of the flight, which is the first sample
     boot_time_s: float
+    # ULog: duration of the IMU samples, else of the topic with the most samples. MAVLink: duration
+    # of the messages with boot time. Outliers of time are ignored
     duration_s: NotNegative
     dropouts: tuple[Dropout, ...] = ()
+    # PX4 parameters for fusion and logging at the start of the log
     parameters: Mapping[str, int | float] = {}
+    # Sentences about dropped samples and clocks
     notes: tuple[str, ...] = ()
     autopilot: str = "PX4"
+    # UNIX time at time zero of the flight
     start_unix_s: float | None = None
+    # Senders of a MAVLink recording, most messages first
     senders: tuple[Sender, ...] = ()
+    # Hexadecimal identifier of the flight controller
     vehicle: str = ""
+    # Sentences about damaged bytes of the file
     damage: tuple[str, ...] = ()
+    # Number of bytes that were read as complete messages
     bytes_read: Count = 0
+    # True if the land detector reports flight at the end of the data
     ends_in_flight: bool = False
+    # Number of restarts of the boot clock; only data between two restarts are used
     restarts: Count | None = None
+    # Number of backward jumps of the recording computer's clock
     receive_time_reversals: Count | None = None
+    # Number of samples with invalid timestamps, by topic, message or file
     dropped: Mapping[str, Count] = {}
+    # Firmware defaults of the changed EKF2 parameters; ULog only
     parameter_defaults: Mapping[str, int | float] = {}
+    # True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis
     is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
 
     __repr__ = one_line_repr

@@ -33,8 +33,8 @@ TableOrUnavailable = pd.DataFrame | Unavailable
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
-# Minimum fraction of sample intervals of up to three times the median for a regular rate; with a
-# smaller fraction, the samples arrive in bursts
+# Minimum fraction of intervals that are at most three times the median; with fewer, samples arrive
+# in bursts
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
@@ -106,122 +106,73 @@ class Alignment(Record, frozen=True, kw_only=True):
 
     A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the
     file to NED.
-
-    Attributes
-    ----------
-    frame, frame_reason : str
-        "ned", "enu" or "nwu", and the reason.
-    yaw_deg : float
-        Rotation about down after C, clockwise seen from above.
-    yaw_sigma_deg : float or None
-        Standard deviation of an estimated yaw.
-    yaw_reason : str
-    origin_m : tuple of float
-        Translation after the rotation (NED).
-    clock_offset_s : float
-        Offset added to the timestamps of the file to obtain boot times.
-    clock_offset_sigma_s : float or None
-        Standard deviation of an estimated clock offset.
-    clock_reason : str
-    reference : str
-        Reference of the estimates: "EKF2 position", "IMU", or "" if nothing was estimated.
-    correlation : float or None
-        Correlation of the track with the reference after alignment; 1 is perfect.
-    residual_rms_m : float or None
-        Horizontal residual (RMS per axis); None if the reference has no position.
-    misplaced : tuple of str
-        Sentences on errors of the frame.
-    warnings : tuple of str
-        Sentences on values with a large uncertainty.
     """
 
+    # Frame of the file: "ned", "enu", "nwu", "eus" or "edn"
     frame: str
     frame_reason: str
+    # Rotation after the conversion to NED, clockwise from above
     yaw_deg: float
     yaw_sigma_deg: NotNegative | None = None
     yaw_reason: str
+    # Position of the origin of the file in NED
     origin_m: Vector
+    # Offset added to the timestamps of the file to obtain boot times
     clock_offset_s: float
     clock_offset_sigma_s: NotNegative | None = None
     clock_reason: str
+    # Reference of the estimates: "EKF2 position", "IMU", or "" if nothing was estimated
     reference: str
+    # Correlation of the track with the reference after alignment; 1 is perfect
     correlation: float | None = None
+    # Horizontal residual (RMS per axis); None if the reference has no position
     residual_rms_m: NotNegative | None = None
+    # Sentences on errors of the frame
     misplaced: tuple[str, ...] = ()
+    # Sentences on values with a large uncertainty
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class PositionTrack:
-    """Positions of one external source over time.
+    """Positions of one external source over time."""
 
-    Attributes
-    ----------
-    name : str
-        Name for ``--position-source``; the PX4 topic if there is one.
-    origin : Origin
-        Kind of the position source, and data path of the positions from sender to log.
-    description : str
-        Description for the user.
-    samples : DataFrame, shape (n, 6)
-        ``north_m, east_m, down_m`` and the reported variances ``north_m2, east_m2, down_m2`` (NaN
-        if not sent or not logged). Rows without position are dropped.
-    frame : str
-        "NED", "FRD" (x is forward at start, not north) or "unknown".
-    clock : str
-        Clock of the timestamps.
-    topics : tuple of str
-        Topics or messages with the data.
-    log : str
-        Name of the file with the data.
-    clock_map : ClockMap or None
-        Map from the sender's clock to the boot clock, if px4fuse made one.
-    alignment : Alignment or None
-        Alignment of a track from a position file.
-    orientation : DataFrame, shape (m, 7), or None
-        Quaternion ``w, x, y, z`` that rotates body FRD to ``frame``, and the reported variances
-        about the body axes ``forward_rad2, right_rad2, down_rad2`` (NaN if not sent). None if the
-        sender gave no orientation or a constant one: a positioning system, not odometry.
-    velocity : DataFrame, shape (n, 6), or None
-        ``north_m_s, east_m_s, down_m_s`` and their variances ``north_m2_s2, …`` at the times of
-        ``samples``, if the source measures velocity (GNSS).
-    age_s : float
-        Delay from measurement to timestamp that EKF2 assumes and that is already subtracted.
-    barometer : DataFrame or None
-        Barometer height ``down_m`` at its times, if it is used for the down axis.
-    lever_arm_m : tuple of float
-        Sensor position in the body frame (forward, right, down) that EKF2 assumes; the track is
-        the position of the sensor.
-    notes : tuple of str
-        Sentences on joined and dropped samples.
-    invalid : Series
-        Rows without a measurement, not in ``samples``, by time, with the reason:
-        "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
-    status : DataFrame
-        ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp) at the times of the
-        source; only those that are logged.
-    step_m : float
-        Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none.
-    """
-
+    # Name for ``--position-source``: the PX4 topic, if there is one
     name: str
     origin: Origin
     description: str
+    # Position in NED and the reported variances (columns POSITION and POSITION_VARIANCE); NaN for
+    # variances that are not logged
     samples: pd.DataFrame
+    # "NED", "FRD" (x is forward at start, not north) or "unknown"
     frame: str
+    # Clock of the timestamps
     clock: str
+    # Topics or messages with the data, and name of their file
     topics: tuple[str, ...]
     log: str = ""
+    # Conversion of the sender's clock to the boot clock, if px4fuse made one
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
+    # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None
+    # for a constant orientation: such a source is not odometry
     orientation: pd.DataFrame | None = None
+    # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None
+    # Delay from measurement to timestamp that EKF2 assumes; it is already subtracted
     age_s: float = 0.0
+    # Barometer height ``down_m``, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
+    # Position of the sensor in the body frame (FRD) that EKF2 assumes
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Sentences on joined and dropped samples
     notes: tuple[str, ...] = ()
+    # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0) or "held" (the last
+    # position sent again)
     invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
+    # ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp), if logged
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
+    # Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none
     step_m: float = 0.0
 
     __repr__ = one_line_repr
@@ -320,58 +271,35 @@ FLOW_FILTER_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """Logged data of EKF2 at its fusion horizon, from which the replay starts.
+    """Logged data of EKF2 at its fusion horizon, from which the replay starts."""
 
-    Attributes
-    ----------
-    parameters : mapping
-        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
-    delayed : DataFrame, shape (n, 43)
-        State and variances at the fusion horizon. ``w, x, y, z`` rotates body FRD to NED; velocity
-        and position are NED (horizontal position NaN if PX4 stores latitude and longitude); biases
-        of gyro (rad/s) and accelerometer (m/s²) are in body FRD; magnetic fields of the earth
-        (NED) and the body (FRD) are in gauss. Then the variances of attitude error about north,
-        east and down, of velocity, position, the biases and both fields.
-    per_step_biases : bool
-        True if the PX4 release stores biases as increments per prediction (up to v1.14).
-    other_aiding : tuple of str
-        Horizontal aiding sources other than external vision position that EKF2 used at any time.
-    vision_age_s : Series
-        Delay (s) from measurement to publication of each external vision sample, indexed by
-        measurement time; empty if not logged.
-    field_gauss : DataFrame, shape (m, 4) or (m, 7)
-        Measured magnetic field (body FRD) and ``fused_3d``, 1 while EKF2 fuses all components, 0
-        while it fuses the heading only; empty if not logged. Since v1.16 also EKF2's low-pass
-        filtered innovations (expected minus measured).
-    flow : DataFrame, shape (l, 5)
-        Velocity from optical flow, ``forward_m_s`` and ``right_m_s`` (body FRD): weighted mean of
-        ``samples`` values at intervals of ``interval_s``, with a higher weight of later values
-        (:data:`FLOW_FILTER_WEIGHT`). The index is the time of the last value; ``noise_m2_s2`` is R
-        of each value. Empty if not logged.
-    latitude_deg : float
-        Latitude of the origin; NaN if not logged.
-    altitude_m : float
-        Altitude of the origin if EKF2 stores altitude above sea level (since v1.16); otherwise 0.
-    height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 4)
-        Updates of the height of the aid minus height of the reference: ``bias_m`` and its variance
-        ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``.
-    states : mapping from str to Series
-        Step functions: 1 while EKF2 detects ground effect on the barometer
-        (:data:`GROUND_EFFECT`) or wrong vertical acceleration (:data:`BAD_ACCELERATION`), or
-        reports inertial dead reckoning (:data:`DEAD_RECKONING`); otherwise 0. Contains logged
-        states only.
-    """
-
+    # All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units
     parameters: Mapping[str, float]
+    # State and variances at the fusion horizon, in the columns DELAYED_STATE and DELAYED_VARIANCE.
+    # The horizontal position is NaN if PX4 stores latitude and longitude
     delayed: pd.DataFrame
+    # True if the PX4 release stores biases as increments per prediction (up to v1.14)
     per_step_biases: bool
+    # Horizontal aiding sources besides the external vision position that EKF2 fused
     other_aiding: tuple[str, ...]
+    # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
+    # Measured magnetic field (body FRD), ``fused_3d`` (1 while EKF2 fuses all components, 0 for
+    # heading only) and, since v1.16, EKF2's low-pass filtered innovations (expected minus measured)
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
+    # Velocity from optical flow, low-pass filtered with FLOW_FILTER_WEIGHT (body FRD): each row is
+    # a weighted mean of ``samples`` values at intervals of ``interval_s``; ``noise_m2_s2`` is R of
+    # each value
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
+    # Latitude of the origin
     latitude_deg: float = np.nan
+    # Altitude of the origin if EKF2 stores altitude above sea level (since v1.16), else 0
     altitude_m: float = 0.0
+    # Updates of the height bias of each aiding source relative to the height reference: ``bias_m``
+    # and ``bias_m2`` after the update, ``innovation_m`` and its ``variance_m2``
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    # 1 while EKF2 reports GROUND_EFFECT on the barometer, BAD_ACCELERATION (vertical), or inertial
+    # DEAD_RECKONING
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
@@ -382,10 +310,7 @@ class FusionRecord:
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times at which EKF2 was in a state, which is a key of ``states``.
-
-        The mask is False if the state is not logged.
-        """
+        """Return True for each time at which EKF2 was in one of its logged ``states``."""
         steps = self.states.get(state)
         return (
             np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
@@ -394,47 +319,29 @@ class FusionRecord:
 
 @dataclass(frozen=True)
 class AidLog:
-    """Logged innovations, variances and fusion results of one aiding source of EKF2.
+    """Logged innovations, variances and fusion results of one aiding source of EKF2."""
 
-    Attributes
-    ----------
-    topics : tuple of str
-        Topics with the innovations and their variances.
-    axes : tuple of str
-    samples : DataFrame
-        Indexed by measurement time, for each axis: ``innovation_<axis>`` (measurement minus
-        prediction) and ``variance_<axis>`` (S). From ``estimator_aid_src`` topics also
-        ``noise_<axis>`` (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0),
-        for external vision position and barometer ``observation_<axis>``, for the barometer
-        ``filtered_down`` (prediction minus measurement, low-pass filtered), and for positions
-        ``last_fused_s``, the time of the last fusion or reset. In the unit of the aid or its
-        square.
-    enabled : Series or None
-        Step function: 1 while fusion of the source is enabled, otherwise 0; None if not logged.
-    parameters : mapping
-        EKF2 parameters of the aiding source at the start of the log, by PX4 name.
-    excluded_count : int
-        Number of innovations that were dropped because no variance is near in time.
-    unjudged_s : ndarray
-        Times (s) of rows in older topics from which it is unknown whether EKF2 fused the aid.
-    """
-
+    # Topics with the innovations and their variances
     topics: tuple[str, ...]
     axes: tuple[str, ...]
+    # Columns for each axis: ``innovation_<axis>`` (measurement minus prediction) and
+    # ``variance_<axis>`` (S). The topics estimator_aid_src also contain R, the test ratio,
+    # ``fused`` and ``rejected``
     samples: pd.DataFrame
+    # 1 while fusion of the source is enabled, otherwise 0; None if not logged
     enabled: pd.Series[float] | None
+    # EKF2 parameters of the aiding source at the start of the log
     parameters: Mapping[str, float] = field(default_factory=dict)
+    # Number of innovations that were dropped because no variance is near in time
     excluded_count: int = 0
+    # Times of innovations for which the log does not show whether EKF2 fused them
     unjudged_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Return the values of a step function at times.
-
-    Before the first time of the step function, its first value is returned.
-    """
+    """Return the values of a step function at times; before its start, the first value."""
     rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[rows]
 
@@ -450,65 +357,40 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Ekf2:
-    """State, variances and innovations of EKF2, from the primary instance at each time.
+    """State, variances and innovations of EKF2, from the primary instance at each time."""
 
-    Attributes
-    ----------
-    state : DataFrame, shape (n, 6)
-        Position and velocity (m, m/s, NED) as published, including resets.
-    variance : DataFrame, shape (n, 6), or Unavailable
-        Position and velocity variances (m², m²/s²).
-    innovations : mapping from axis name to DataFrame or Unavailable
-        ``innovation_m`` (measurement minus prediction; opposite to PX4's sign),
-        ``innovation_variance_m2``, ``observation_variance_m2`` (NaN if not logged),
-        ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN if not logged).
-    innovation_topics : tuple of str
-    fusing : DataFrame or Unavailable
-        Step functions ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports fusion of this
-        component of external vision.
-    resets : tuple of Reset
-    instances : tuple of (float, int)
-        (Start time, primary instance from then on).
-    gate : float
-        EKF2_EVP_GATE (in √S).
-    notes : tuple of str
-        Sentences on dropped samples and on the origin of the timestamps.
-    accelerometer_bias : DataFrame, shape (n, 3), or Unavailable
-        Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force.
-    step_s : float
-        Prediction interval.
-    horizon_s : float or Unavailable
-        Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
-        propagated to t with the IMU.
-    record : FusionRecord or Unavailable
-        Data at the fusion horizon.
-    aids : mapping from PX4 name to AidLog
-        Logged data of all aiding sources that EKF2 can fuse.
-    states : mapping from name to Series
-        Logged step functions: 1 while an aiding source is enabled, by its PX4 name;
-        ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
-        ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
-    parameters : mapping
-        All EKF2_ parameters at take-off, by PX4 name, in PX4 units.
-    parameter_changes : tuple of ParameterChange
-        Changes of EKF2_ parameters after take-off, in order of time.
-    """
-
+    # Position and velocity (NED) as published, including resets
     state: pd.DataFrame
     variance: TableOrUnavailable
+    # Columns ``innovation_m`` (measurement minus prediction, opposite to PX4's sign),
+    # ``innovation_variance_m2``, ``observation_variance_m2``, ``test_ratio``, ``fused`` and
+    # ``rejected`` (1 or 0); NaN if not logged
     innovations: Mapping[AxisName, TableOrUnavailable]
     innovation_topics: tuple[str, ...]
+    # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
+    # ``yaw``
     fusing: TableOrUnavailable
     resets: tuple[Reset, ...]
+    # (Start time, primary instance from then on)
     instances: tuple[tuple[float, int], ...]
+    # EKF2_EVP_GATE (√S)
     gate: float
+    # Sentences on dropped samples and on the origin of the timestamps
     notes: tuple[str, ...] = ()
+    # Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force
     accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
+    # Prediction interval
     step_s: float = EKF2_STEP_S
+    # Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
+    # propagated to t with the IMU
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
+    # Logged flags, 1 while set: aiding sources that are enabled, by PX4 name; ``tilt_align``,
+    # ``yaw_align``, ``gnss_fault``, ``xy_valid``, ``xy_global``, and the keys of
+    # FusionRecord.states. ``failed_checks`` is gps_check_fail_flags
     states: StepFunctions = field(default_factory=dict)
+    # All EKF2_ parameters at take-off, by PX4 name, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
     parameter_changes: tuple[ParameterChange, ...] = ()
 
@@ -552,8 +434,7 @@ class Flight:
     ----------
     log : LogInfo
     imu : DataFrame or Unavailable
-        Specific force (m/s², body FRD, not bias corrected), angular rate (rad/s, body FRD) and, if
-        logged, ``clipped``: above 0 if an accelerometer reached the limit of its range.
+        Specific force (m/s²) and angular rate (rad/s), body FRD, without bias correction.
     attitude : DataFrame or Unavailable
         Quaternion w, x, y, z that rotates body FRD to NED.
     positions : tuple of PositionTrack
@@ -561,27 +442,11 @@ class Flight:
     ekf2 : Ekf2 or Unavailable
     truth : Truth or Unavailable
     airborne : tuple of (float, float), or Unavailable
-        Intervals (s) in which the land detector reports flight; empty if none.
-    missing : tuple of Unavailable
-        Missing data, with reason and action.
-    streams : mapping from kind of data to Stream
-        Source of the data: "imu", "attitude", "ekf2_state", "ekf2_variance",
-        "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
-    clocks : tuple of ClockMap
-        Maps from other clocks to the boot clock.
-    unused : tuple of UnusedData
-        Other position-related data in the log that px4fuse does not use.
-    inputs : tuple of InputFile
-        Files read in addition to the log.
-    modes : tuple of FlightMode, or Unavailable
-        Flight modes in order of time, without overlap.
-    tumble_spans : tuple of (float, float)
-        Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits.
-    barometer : DataFrame or None
-        Barometer height ``down_m``, with unknown zero.
+        Intervals (s) in which the land detector reports flight.
     """
 
     log: LogInfo
+    # ``clipped``, if logged, is above 0 if an accelerometer reached the limit of its range
     imu: TableOrUnavailable
     attitude: TableOrUnavailable
     positions: tuple[PositionTrack, ...]
@@ -589,19 +454,25 @@ class Flight:
     truth: Truth | Unavailable
     airborne: Spans | Unavailable
     missing: tuple[Unavailable, ...] = ()
+    # Source of each kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
+    # "ekf2_innovations", "ekf2_fusing", "truth", "airborne"
     streams: Mapping[str, Stream] = field(default_factory=dict)
     clocks: tuple[ClockMap, ...] = ()
+    # Other position-related data in the log that px4fuse does not use
     unused: tuple[UnusedData, ...] = ()
+    # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
+    # Intervals in which PX4's failure detector reports roll or pitch beyond the limits
     tumble_spans: Spans = ()
+    # Barometer height ``down_m`` with unknown zero
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
 
 
 def join_flights(airborne: Spans) -> Spans:
-    """Return start and end (s) of each flight; shorter landings do not separate flights."""
+    """Return start and end (s) of each flight, separated by at least MIN_LANDED_S on the ground."""
     flights: list[Span] = []
     for start_s, end_s in airborne:
         if flights and start_s - flights[-1][1] < MIN_LANDED_S:
@@ -625,10 +496,8 @@ def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
 def sample_rate(samples: pd.DataFrame) -> float:
     """Return the sample rate (Hz) outside of gaps of a table that is indexed by time.
 
-    The rate is the inverse mean of all intervals up to three times the median. The median alone
-    would be wrong for a decimated topic, which alternates between two intervals. For samples in
-    bursts, without a regular interval, the mean of all intervals is used. The result is NaN for
-    fewer than two samples.
+    The mean interval is used, because a decimated topic alternates between two intervals. The
+    result is NaN for fewer than two samples.
     """
     if len(samples) < 2:
         return float("nan")

@@ -1,4 +1,4 @@
-"""Origin of a position track: kind of position source, and data path from sender to log."""
+"""Origin of a position track: kind of position source, and its path from the sender to the log."""
 
 from typing import Literal
 
@@ -14,23 +14,14 @@ DataPath = Literal[
 
 
 class Origin(Record, frozen=True):
-    """Kind of a position source, and the data path of its positions from the sender to the log.
+    """Kind of a position source, and the path of its positions from the sender to the log."""
 
-    Attributes
-    ----------
-    kind : str
-        "uwb" is any positioning system without orientation, "vio" is any odometry.
-    path : str
-        Data path from the sender to the log.
-    aid : Aid or None
-        Aiding source as which EKF2 fuses the positions; None if EKF2 never fuses them.
-    is_automatic : bool
-        True if px4fuse may select the source by default; for GNSS, True only if EKF2 fused it.
-    """
-
+    # "uwb" is any positioning system without orientation, "vio" is any odometry
     kind: PositionKind
     path: DataPath
+    # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
+    # True if px4fuse may select the source without --position-source
     is_automatic: bool = True
 
     @property
@@ -81,15 +72,14 @@ ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
-# All origins in order of preference. px4fuse assumes that EKF2 fused the source of a position file
+# All origins in order of preference
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
 def find_origin(kind: str, path: str) -> Origin:
-    """Return the origin in :data:`ORIGINS` with this kind of source and data path."""
     return {(origin.kind, origin.path): origin for origin in ORIGINS}[kind, path]  # type: ignore[index]
 
 
-def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the source sends a changing orientation (``turns``)."""
-    return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin
+def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
+    """Change the kind "uwb" to "vio" if the source sends a changing orientation."""
+    return replace(origin, kind="vio") if origin.kind == "uwb" and is_changing else origin

@@ -276,8 +276,6 @@ def analyse_flight_loop(
 
     The result is Unavailable without odometry, or if the odometry does not end near its start.
     """
-    if flight.log.is_assessed:
-        return WITHHELD
     odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")

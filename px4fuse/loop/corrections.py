@@ -8,7 +8,6 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.core.record import to_serializable
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
@@ -198,10 +197,8 @@ def score_paths(
         name: CorrectionName, path: Trajectory, solution: Solution | None
     ) -> CorrectedPath:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
-        costs: dict[str, Any] = (
-            {} if solution is None else structs.asdict(to_serializable(solution))
-        )
-        costs.pop("dropped", None)
+        names = ("cost_initial", "cost", "iterations", "converged")
+        costs = {} if solution is None else {name: getattr(solution, name) for name in names}
         return CorrectedPath(
             name=CORRECTION_LABELS[name],
             trajectory=path,

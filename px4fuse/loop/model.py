@@ -7,10 +7,18 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
+from px4fuse.core.record import (
+    NOT_WRITTEN,
+    Count,
+    NotNegative,
+    NotWritten,
+    OrUnavailable,
+    Record,
+    Share,
+    Unavailable,
+)
 from px4fuse.errors import MissingDataError
-from px4fuse.trajectory.evaluation import Evaluation, Score
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
@@ -122,23 +130,15 @@ class Closure(Record, frozen=True, kw_only=True):
         return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
-class Correction(Record, frozen=True, kw_only=True):
-    """Size (m) of a path correction, cost of its pose graph, and scores against each reference."""
-
-    correction_max_m: NotNegative
-    correction_rms_m: NotNegative
-    cost_initial: NotNegative | None = None
-    cost: NotNegative | None = None
-    iterations: Count | None = None
-    converged: bool | None = None
-    scores: Mapping[str, OrUnavailable[Score]]
-
-
-class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
-    """Corrected path, or uncorrected odometry.
+class CorrectedPath(Record, frozen=True, kw_only=True):
+    """Corrected path, or uncorrected odometry, with its scores against each reference.
 
     Attributes
     ----------
+    correction_max_m, correction_rms_m : float
+        Size of the correction.
+    cost_initial, cost, iterations, converged
+        See :class:`~px4fuse.trajectory.graph.solver.Solution`; None without pose graph.
     scores : mapping from reference name to Evaluation or Unavailable
     name : str
     trajectory : Trajectory
@@ -147,23 +147,38 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
         Solution of the pose graph; None for a correction without pose graph.
     """
 
-    schema_type = Correction
-    scores: Mapping[str, Evaluation | Unavailable]
-    name: str
-    trajectory: Trajectory
-    solution: Solution | None = None
+    correction_max_m: NotNegative
+    correction_rms_m: NotNegative
+    cost_initial: NotNegative | None = None
+    cost: NotNegative | None = None
+    iterations: Count | None = None
+    converged: bool | None = None
+    scores: Mapping[str, OrUnavailable[Evaluation]]
+    name: NotWritten[str] = NOT_WRITTEN
+    trajectory: NotWritten[Trajectory] = NOT_WRITTEN
+    solution: NotWritten[Solution | None] = None
 
-    __repr__ = one_line_repr
 
-
-class LoopResult(Record, frozen=True, kw_only=True):
-    """Loop analysis for results.json: path, landing place, closure errors and corrections.
+class Loop(Record, frozen=True, kw_only=True):
+    """Result of ``px4fuse loop``: path, landing place, closure errors and corrections.
 
     ``closure_error_m`` is the distance between measured and true end, and ``closure_percent`` this
     distance in per cent of the path length. ``is_absolute_track`` is True if the track follows a
     positioning system and does not drift. The correction ``by_distance_plain`` changes positions
     only (UAT 366, Example 2). ``by_distance`` also changes headings, if the heading error is
     known.
+
+    Attributes
+    ----------
+    distance_m : ndarray, shape (n,)
+        Distance along the key frames at each pose.
+    graph : PoseGraph or Unavailable
+        Pose graph with all closures, before optimisation.
+    references : tuple of Trajectory
+    original_frame : Frame
+        Frame of the trajectory before the conversion to z down.
+    is_assessed : bool
+        True if the flight is an assignment, so that its findings are withheld.
     """
 
     track: str
@@ -186,36 +201,13 @@ class LoopResult(Record, frozen=True, kw_only=True):
     is_absolute_track: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
-    corrections: Mapping[CorrectionName, OrUnavailable[Correction]]
+    corrections: Mapping[CorrectionName, OrUnavailable[CorrectedPath]]
     notes: tuple[str, ...]
-
-
-class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
-    """Result of ``px4fuse loop``: :class:`LoopResult` with the paths.
-
-    Attributes
-    ----------
-    corrections : mapping from correction name to CorrectedPath or Unavailable
-    distance_m : ndarray, shape (n,)
-        Distance along the key frames at each pose.
-    graph : PoseGraph or Unavailable
-        Pose graph with all closures, before optimisation.
-    references : tuple of Trajectory
-    original_frame : Frame
-        Frame of the trajectory before the conversion to z down.
-    is_assessed : bool
-        True if the flight is an assignment, so that its findings are withheld.
-    """
-
-    schema_type = LoopResult
-    corrections: Mapping[CorrectionName, CorrectedPath | Unavailable]
-    distance_m: Array
-    graph: PoseGraph | Unavailable
-    references: tuple[Trajectory, ...]
-    original_frame: Frame
-    is_assessed: bool = False
-
-    __repr__ = one_line_repr
+    distance_m: NotWritten[Array] = NOT_WRITTEN
+    graph: NotWritten[PoseGraph | Unavailable] = NOT_WRITTEN
+    references: NotWritten[tuple[Trajectory, ...]] = NOT_WRITTEN
+    original_frame: NotWritten[Frame] = NOT_WRITTEN
+    is_assessed: NotWritten[bool] = False
 
     @property
     def odometry(self) -> CorrectedPath:

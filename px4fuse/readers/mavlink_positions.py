@@ -101,7 +101,7 @@ def _read_track(
     return px4_positions.make_track(
         name,
         samples,
-        with_orientation(source.origin, turns=orientation is not None),
+        with_orientation(source.origin, is_changing=orientation is not None),
         remedy=remedy,
         description=source.description,
         frame=frame,

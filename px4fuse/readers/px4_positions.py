@@ -156,7 +156,7 @@ def _make_ulog_track(
 ) -> PositionTrack | Unavailable:
     """Make a ULog track; ``turns`` is True if the source sends a changing orientation."""
     source = px4.TRACKS[name]
-    origin = with_orientation(source.origin, turns=turns)
+    origin = with_orientation(source.origin, is_changing=turns)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)

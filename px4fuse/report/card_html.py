@@ -14,7 +14,6 @@ from px4fuse.card.build import build_card, describe_axis
 from px4fuse.card.model import (
     AXIS_TICKS,
     FILTER_NAMES,
-    SIGMA_RATIO_BANDS,
     Card,
     Rerun,
     Verdict,
@@ -23,6 +22,7 @@ from px4fuse.card.model import (
 from px4fuse.card.verdicts import verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_TICKS,
@@ -164,7 +164,7 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
     """Return the SVG attributes for one σ ratio: its consistent band, 95 % interval and mark."""
     if verdict.ratio is None:
         return {}
-    low, high = (axis_fraction(end) for end in SIGMA_RATIO_BANDS[verdict.against])
+    low, high = (axis_fraction(end) for end in CONSISTENT_RATIOS[verdict.against])
     fraction = axis_fraction(verdict.ratio)
     symbol = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
     marks = []

@@ -16,7 +16,6 @@ from px4fuse.card.model import (
     AXIS_TICKS,
     FILTER_NAMES,
     MAX_NOTES,
-    SIGMA_RATIO_BANDS,
     Action,
     AidRow,
     Card,
@@ -26,7 +25,7 @@ from px4fuse.card.model import (
     axis_fraction,
 )
 from px4fuse.core.text import format_metres, format_ratio
-from px4fuse.filter.consistency import Reference
+from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100
@@ -180,7 +179,7 @@ def band_limits() -> str:
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
     """
     return ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
+        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in CONSISTENT_RATIOS.items()
     )
 
 
@@ -192,7 +191,7 @@ def axis_text(ratio: float | None, reference: Reference) -> str:
     >>> axis_text(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_column(end) for end in SIGMA_RATIO_BANDS[reference])
+    low, high = (_column(end) for end in CONSISTENT_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
         column = _column(ratio)
@@ -355,7 +354,7 @@ def _verdict_line(verdict: Verdict) -> Line:
         return Line(text, "", head, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
-    style = "bold" if verdict.is_loud else ""
+    style = "bold" if verdict.is_fault else ""
     return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
 
 

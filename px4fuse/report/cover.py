@@ -11,7 +11,6 @@ from px4fuse.card.model import (
     AXIS_ENDS,
     AXIS_TICKS,
     FILTER_NAMES,
-    SIGMA_RATIO_BANDS,
     Action,
     AidRow,
     Card,
@@ -20,7 +19,7 @@ from px4fuse.card.model import (
     axis_fraction,
 )
 from px4fuse.core.text import format_ratio
-from px4fuse.filter.consistency import Reference
+from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_HEADING,
@@ -149,7 +148,7 @@ def _verdict_row(verdict: Verdict) -> dict[str, Any]:
         "quantity": quantity,
         "word": word,
         "quiet": verdict.is_explained,
-        "loud": verdict.is_loud,
+        "loud": verdict.is_fault,
         **_ratio_marks(verdict.ratio, verdict.against, verdict.interval),
     }
 
@@ -177,7 +176,7 @@ def _ratio_marks(
         "shape": "circle" if reference == "source" else "diamond",
         "fraction": fraction,
         "beyond": beyond,
-        "band": [axis_fraction(end) for end in SIGMA_RATIO_BANDS[reference]],
+        "band": [axis_fraction(end) for end in CONSISTENT_RATIOS[reference]],
         "interval": None if interval is None or beyond else list(map(_clipped_place, interval)),
     }
 

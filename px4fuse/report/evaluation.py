@@ -68,7 +68,7 @@ def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
 
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw both paths from above before the alignment, and the aligned path coloured by error."""
-    frame, is_aligned = evaluation.reference.frame, evaluation.alignment != "none"
+    frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     map_axes = list(MAP_AXES[frame])
     right, up = (AXES_OF_FRAME[frame][index] for index in map_axes)
     columns, estimate_handle = [], []
@@ -213,8 +213,8 @@ def summary(evaluation: Evaluation) -> str:
 
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     """Write estimate, reference, method and the table of error statistics."""
-    page.write_labelled("Estimate", describe_track(evaluation.estimate))
-    page.write_labelled("Against", describe_track(evaluation.reference))
+    page.write_labelled("Estimate", describe_track(evaluation.estimate_track))
+    page.write_labelled("Against", describe_track(evaluation.reference_track))
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])

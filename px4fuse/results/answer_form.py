@@ -32,9 +32,9 @@ EMPTY_CELL = "\u2013"
 
 
 class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
-    """Injected fault that a flight can have: description, quantity of its size, and allowed sizes.
+    """Injected fault that a student can name, with the quantity of its size.
 
-    ``range``: smallest and largest size, in the first unit of the quantity.
+    ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
     """
 
     description: str
@@ -48,7 +48,7 @@ class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
 
 
 class FormChoices(Record, frozen=True):
-    """Allowed answers of the answer form (``form.toml``); ``renamed``: new names of old answers."""
+    """Allowed answers of the answer form (``form.toml``), and new names of old answers."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
@@ -61,8 +61,7 @@ class FormChoices(Record, frozen=True):
 _CHOICES = table(__file__, "form.toml", FormChoices)
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
-# Corrections of injected faults that a form can name, with the units of their values (empty: no
-# value)
+# Corrections of injected faults, with the units of their values (empty without a value)
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 # Verdict on a filter without innovations
 NOT_AVAILABLE = "not available"
@@ -78,36 +77,31 @@ ACCEPTED_VALUES = {
     **dict.fromkeys(
         ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
     ),
-    "when": "whole flight, or from_s and until_s",
-    "ekf2_did": "a list of texts",
+    "when": '"whole flight", or an empty text with the times from_s and until_s',
+    "ekf2_did": "a list of behaviours, each in quotes",
     "predictions": "a letter from a to e in quotes",
-    "log_sha256": "the text of the empty form: make it again with px4fuse answers",
+    "log_sha256": "the SHA-256 of the log, which px4fuse answers writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
-# Answer to a question about a number: the number, a list of update numbers, or None (no answer)
+# Answer to a question about KF: a number, a list of update numbers, or None if left blank
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-# Answers to a question with a prediction: the range that contains the value
+# Names of the ranges from which the student chooses a prediction
 PREDICTION_RANGES: tuple[RangeName, ...] = ("a", "b", "c", "d", "e")
 MAX_PREDICTIONS = 10
 PREDICTIONS_HEAD = """
-# Predictions: numbers along the main axis, in reports with SIGMA_A 0.5 and SIGMA_Z 0.1, if the
-# flight were simulated again with one change. Give the letter of the range. A wrong letter costs a
-# quarter of the points of a right one.
+# Predictions: the same flight was simulated again with one change, and analysed with SIGMA_A 0.5
+# and SIGMA_Z 0.1. Give the letter of the range that contains the number along the main axis.
+# A wrong letter costs a quarter of the points of a right letter.
 [predictions]
 """
 
 
 class Prediction(Record, frozen=True):
-    """Question on a number of another simulation of the flight, which no output contains.
+    """Question which of five ranges contains a number of the flight, simulated with one change.
 
-    Attributes
-    ----------
-    quantity : str
-        Predicted number, with the change of the simulation.
-    limits : tuple of float
-        Limits between the five ranges, ascending.
+    ``quantity`` names the number and the change, ``limits`` are the four limits between the ranges.
     """
 
     quantity: str
@@ -117,28 +111,17 @@ class Prediction(Record, frozen=True):
     def text(self) -> str:
         """Question and ranges as the answer form prints them."""
         first, *_, last = numbers = [f"{limit:.3g}" for limit in self.limits]
-        between = [f"{low} to {high}" for low, high in pairwise(numbers)]
-        texts = (f"below {first}", *between, f"above {last}")
-        ranges = ", ".join(map(": ".join, zip(PREDICTION_RANGES, texts, strict=True)))
-        return f"{self.quantity}; {ranges}"
+        middle_ranges = [f"{low} to {high}" for low, high in pairwise(numbers)]
+        ranges = (f"below {first}", *middle_ranges, f"above {last}")
+        ranges_text = ", ".join(map(": ".join, zip(PREDICTION_RANGES, ranges, strict=True)))
+        return f"{self.quantity}; {ranges_text}"
 
 
 class StudentMistake(Record, frozen=True):
     """Injected fault of a flight that a student names in the answer form.
 
-    Attributes
-    ----------
-    kind : str
-        One of :data:`MISTAKES`.
-    size : float or None
-        Size of the injected fault with sign, in ``unit``.
-    when : str
-        "whole flight", or empty if ``from_s`` and ``until_s`` (s since the first data) are given.
-    parameter : str
-        Correction of the injected fault, one of :data:`CORRECTIONS`, with its ``value`` in
-        ``value_unit``.
-    panel : str
-        Panel of the report that shows the injected fault, one of :data:`PANELS`.
+    ``from_s`` and ``until_s`` are times since the first data. ``parameter`` is a correction with a
+    ``value``, and ``panel`` the part of the report that shows the fault.
     """
 
     kind: str
@@ -174,16 +157,12 @@ class Answers(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    log_sha256 : str
-        SHA-256 of the flight log.
-    verdict_kf, verdict_ekf2 : str
-        Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
     ekf2_did : tuple of str
-        Behaviour of EKF2, from :data:`EKF2_BEHAVIOURS`.
+        Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
-        Answers to :func:`draw_questions`; a tuple lists update numbers.
+        Answers to :func:`draw_questions`; for the gate, the numbers of the updates outside it.
     predictions : tuple of str
-        Ranges that the student chose for each :class:`Prediction`; "" if left blank.
+        Range that the student chose for each :class:`Prediction`; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -210,18 +189,14 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record, frozen=True):
-    """Question to the student about a number of KF that no report prints.
+    """Question about KF along the main axis, which the student answers with an own filter.
 
     Attributes
     ----------
-    kind : str
-        Requested quantity along the main horizontal axis of the flight ("aisle").
     update : int
         Number of the KF update, from 1; the first measurement sets the state and is not counted.
-    sigma_a_m_s2, sigma_z_m : float
-        Settings of KF for this question.
     duration_or_gate : float
-        For "prediction": time without measurement (s). For "gate": gate (in √S).
+        For the kind "prediction" the time without measurement (s), for "gate" the gate (in √S).
     """
 
     kind: QuestionKind
@@ -251,7 +226,7 @@ GATE_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Draw three questions at random, with the SHA-256 of the log as seed."""
+    """Draw three questions about KF at random, with the SHA-256 of the log as seed."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def draw_between(low: float, high: float, decimals: int) -> float:
@@ -291,7 +266,7 @@ def read_answers(path: Path) -> Answers:
 
 
 def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
-    """Name the field, its value and the accepted values, or the line that is not TOML."""
+    """Describe the invalid answer and the accepted values, or the line that is not TOML."""
     message = str(error)
     if line := re.search(r"\(at line (\d+), column \d+\)", message):
         content = one_line(text.splitlines()[int(line[1]) - 1], 60)
@@ -405,10 +380,7 @@ def form_name(log_name: str) -> str:
 
 
 def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] = ()) -> str:
-    """Return an empty answer form (TOML) for a log; its comments list all allowed answers.
-
-    ``predictions``: questions of the answer key, for an assigned flight.
-    """
+    """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
     template = Template(
         files("px4fuse.results").joinpath("answer_form.toml").read_text(encoding="utf-8")
     )

@@ -30,45 +30,29 @@ from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import Graph
 
-# Fields of an Analysis that the results contain without change
-_COPIED_FIELDS = (
-    "axes",
-    "horizontal",
-    "tuning",
-    "clock",
-    "heading",
-    "ekf2_replay",
-    "difference_steps",
-    "trials",
-    "loop",
-    "findings",
-    "notes",
-    "missing",
-    "convention",
-)
-
 
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
     """Return the results of ``px4fuse compare`` on a flight with positions for KF.
 
-    On a flight that is an assignment, the card contains the student's answers.
+    The diagnosis on an assigned flight is replaced by the student's answers.
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
         rows = form_rows(student.answers)
         texts = (f"{label}: {text}" for label, text in rows if text != EMPTY_CELL)
         card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
-    return within_bounds(
-        contract.ComparisonResults(
-            **_flight_fields(contract.COMPARISON_SCHEMA, request, analysis),
-            **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
-            aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            card=card,
-            student=student,
-        )
-    )
+    fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
+        "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
+        "card": card,
+        "student": student,
+    }
+    # all other fields have the same name and content in the analysis
+    for name in contract.ComparisonResults.__struct_fields__:
+        if name not in fields:
+            fields[name] = to_serializable(getattr(analysis, name))
+    return within_bounds(contract.ComparisonResults(**fields))
 
 
 def outcome_results(
@@ -147,8 +131,8 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
-            estimate=score.estimate.track(),
-            reference=score.reference.track(),
+            estimate=score.estimate_track.track(),
+            reference=score.reference_track.track(),
             provenance=provenance(command_line(request)),
             **msgspec.structs.asdict(to_serializable(score)),
         )

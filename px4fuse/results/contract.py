@@ -13,26 +13,26 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.card.model import Card
-from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.replay import Agreement, Replayed
-from px4fuse.ekf2.steps import DifferenceSteps
+from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.time_offset import Clock
-from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight.log import ClockMap, InputFile, LogInfo
 from px4fuse.flight.model import Alignment
 from px4fuse.flight.position_source import DataPath, PositionKind
-from px4fuse.loop.model import LoopResult
+from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
-from px4fuse.trajectory.evaluation import Score
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import Graph
 from px4fuse.trajectory.model import Track
 
@@ -98,7 +98,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of NoiseEstimate that contains the maximum-likelihood estimate, by KF setting
+# Field of AxisTuning that contains the maximum-likelihood estimate, by KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
@@ -108,7 +108,7 @@ Interval = tuple[float, float | None]
 
 
 class DiffInput(Record, frozen=True, kw_only=True):
-    """Input A or B of ``px4fuse diff``: file that the user named, and log that it refers to."""
+    """Input A or B of ``px4fuse diff``: file name (``given``), and the log of its results."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -118,18 +118,10 @@ class DiffInput(Record, frozen=True, kw_only=True):
 
 
 class NumberChange(Record, frozen=True, kw_only=True):
-    """Numeric result that differs between the inputs A and B.
+    """Number that differs between the inputs A and B, with 95 % intervals if there are any.
 
-    Attributes
-    ----------
-    path : str
-        Path in the results: ``axes.aisle.filters.ekf2.nis_mean``.
-    label, unit : str
-        Name for the user, and unit ("share" for a fraction from 0 to 1).
-    a, b : float
-        Value in A and in B; absent if the results of that input do not contain the number.
-    a_interval, b_interval : (float, float or None)
-        95 % intervals; absent if the results contain none.
+    ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
+    "share" is a fraction from 0 to 1. ``a`` or ``b`` is absent if only one input has the number.
     """
 
     path: str
@@ -173,54 +165,33 @@ class ComparisonResults(_FlightResults, frozen=True):
 
     Attributes
     ----------
-    schema : Schema
-    request : ComparisonRequest
-        Files and settings of the analysis.
-    log : Log
-    source : PositionSource
-    settings : ChosenSettings
-    axes : mapping of axis name to AxisResult
-    horizontal : mapping of "kf" and "ekf2" to HorizontalNis
-    tuning : mapping of axis name, or "horizontal" for north and east together, to NoiseEstimate
-    clock : Clock
+    tuning : mapping of axis name to AxisTuning
+        "horizontal" stands for north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
-    ekf2_replay : Replayed
+    ekf2_replay : Ekf2Replay
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
-    difference_steps : mapping of axis name to DifferenceSteps
-        Changes of the difference KF - EKF2 by each replacement of one KF property by the EKF2
-        property.
+    difference_steps : mapping of axis name to DifferenceExplanation
+        Difference KF - EKF2 while the settings of KF are replaced by those of EKF2 one at a time.
     trials : tuple of Trial
-        Re-runs with a change along the aisle, else along the first axis, and along each axis whose
-        mean NIS or NEES is outside its limits.
-    aids : mapping of PX4's name to AidResult
-        Aiding sources of EKF2 with statistics of their innovations; empty without innovations.
-    loop : LoopResult
+        Re-runs of both filters, each with one change.
     card : Card
         Diagnosis that cover, terminal, web page and batch table show.
-    findings : tuple of Finding
-        Most severe first; of the same severity, missing data before noises.
-    notes : tuple of str
-        Sentences on choices of the analysis.
-    missing : tuple of Unavailable
-        Missing data, with reasons and actions.
-    student : Student
-    provenance : Provenance
     convention : Convention
         Axes, unit, clock and orientation of the source as sent. Absent for GNSS, and without IMU or
         attitude.
     """
 
-    axes: Annotated[dict[AxisName, AxisResult], Meta(min_length=1)]
+    axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
     horizontal: dict[FilterName, HorizontalNis]
-    tuning: dict[str, OrUnavailable[NoiseEstimate]]
-    clock: OrUnavailable[Clock]
+    tuning: dict[str, OrUnavailable[AxisTuning]]
+    clock: OrUnavailable[ClockOffset]
     heading: OrUnavailable[HeadingError]
-    ekf2_replay: OrUnavailable[Replayed]
-    difference_steps: dict[str, OrUnavailable[DifferenceSteps]]
+    ekf2_replay: OrUnavailable[Ekf2Replay]
+    difference_steps: dict[str, OrUnavailable[DifferenceExplanation]]
     trials: tuple[Trial, ...]
     aids: dict[str, AidResult]
-    loop: OrUnavailable[LoopResult]
+    loop: OrUnavailable[Loop]
     card: Card
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -247,14 +218,14 @@ class AidsResults(Record, frozen=True):
 class TuningResults(_FlightResults, frozen=True):
     """Results of ``px4fuse tune``: maximum-likelihood estimates of the noises, by axis."""
 
-    tuning: dict[str, OrUnavailable[NoiseEstimate]]
+    tuning: dict[str, OrUnavailable[AxisTuning]]
     provenance: Provenance
 
 
 class SyncResults(_FlightResults, frozen=True):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
-    clock: OrUnavailable[Clock]
+    clock: OrUnavailable[ClockOffset]
     provenance: Provenance
 
 
@@ -265,7 +236,7 @@ class LoopResults(Record, frozen=True):
     request: LoopRequest
     track: Track
     references: tuple[Track, ...]
-    loop: LoopResult
+    loop: Loop
     findings: tuple[Finding, ...]
     student: Student
     provenance: Provenance
@@ -279,7 +250,7 @@ class GraphResults(Record, frozen=True):
     provenance: Provenance
 
 
-class EvaluationResults(Score, frozen=True, kw_only=True):
+class EvaluationResults(Evaluation, frozen=True, kw_only=True):
     """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
 
     schema: Schema
@@ -291,9 +262,9 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the parameters in
-    ``whatif`` are the maximum-likelihood estimates. ``sweep`` contains one summary per value of the
-    swept parameter.
+    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the user gave no
+    parameters, so that ``whatif`` has the maximum-likelihood estimates. ``sweep`` has one summary
+    per value of the swept parameter.
     """
 
     schema: Schema
@@ -313,16 +284,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
 class ChangeResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse diff``: differences from A to B.
 
-    Attributes
-    ----------
-    schema : Schema
-    a, b : DiffInput
-    settings : tuple of SettingChange
-    numbers : tuple of NumberChange
-    findings : tuple of FindingChange
-    worse : tuple of str
-        One sentence for each verdict that is worse in B; the exit code is 1 if there is one.
-    provenance : Provenance
+    ``worse`` has one sentence for each verdict that is worse in B; the exit code is then 1.
     """
 
     schema: Schema
@@ -365,16 +327,18 @@ def schema() -> dict[str, Any]:
     kinds: dict[type, None] = dict.fromkeys(RESULTS_BY_SCHEMA.values())
     components: dict[str, Any] = {}
 
-    def describe_union(kind: Any) -> dict[str, Any]:
+    def describe(kind: Any) -> dict[str, Any]:
+        if kind is msgspec.UnsetType:  # a field that is not written
+            return {"not": {}}
         kinds.update(dict.fromkeys(kind.union_members))
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
     count = 0
-    # each iteration adds the types inside RecordOrUnavailable, which msgspec does not resolve
+    # repeated until describe_union finds no new types inside of RecordOrUnavailable types
     while count < len(kinds):
         count = len(kinds)
         _, components = msgspec.json.schema_components(
-            list(kinds), schema_hook=describe_union, ref_template="#/$defs/{name}"
+            list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
         )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

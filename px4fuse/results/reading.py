@@ -48,10 +48,10 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = value.get("provenance")
         writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the version that wrote it"
+        reader = one_line(str(writer), 60) if writer else "of that schema version"
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
-            f"Create the report again, or read it with {reader}.",
+            f"Create the report again, or read it with px4fuse {reader}.",
         )
     if int(version.partition(".")[2]) > int(minor):
         value = _known_fields(value, kind)

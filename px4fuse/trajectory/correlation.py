@@ -1,9 +1,10 @@
 """Correlation of two series with gaps at all lags, and autocovariance of a series."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from scipy import fft
 
 from px4fuse.core.arrays import Array, BoolArray, Complex
 
@@ -69,8 +70,14 @@ def autocovariance(values: Array | Complex) -> Array:
 
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
-    """Compute Σ a conj(b) over the common samples, at each lag."""
-    # Local import, because it takes 0.1 s and most flights need no correlation
-    from scipy.signal import correlate  # noqa: PLC0415
+    """Compute Σ a conj(b) over the common samples, at each lag.
 
-    return np.asarray(correlate(a, b, mode="full", method="fft"))
+    Like ``scipy.signal.correlate``, whose import takes 0.3 s.
+    """
+    size = len(a) + len(b) - 1
+    is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)
+    transform: Any = fft.fft if is_complex else fft.rfft
+    inverse: Any = fft.ifft if is_complex else fft.irfft
+    padded_size = fft.next_fast_len(size, not is_complex)
+    spectrum = transform(a, padded_size) * transform(np.conj(b[::-1]), padded_size)
+    return np.asarray(inverse(spectrum, padded_size)[:size])

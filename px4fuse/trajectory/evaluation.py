@@ -14,8 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.core.arrays import Array, median_interval
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import OrUnavailable, Record
+from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
@@ -61,8 +60,8 @@ class AbsoluteError(Record, frozen=True):
     rotation_deg: OrUnavailable[Statistics]
 
 
-class Score(Record, frozen=True, kw_only=True):
-    """ATE and RPE of an estimate against a reference, with alignment and time offset.
+class Evaluation(Record, frozen=True, kw_only=True):
+    """ATE and RPE of an estimate against a reference, with alignment, time offset and tracks.
 
     Attributes
     ----------
@@ -78,6 +77,15 @@ class Score(Record, frozen=True, kw_only=True):
     rpe : tuple of RelativeError
     notes, warnings : tuple of str
         Sentences for the user.
+    estimate_track, reference_track : Trajectory
+        Complete trajectories, before association and alignment.
+    time_s : ndarray, shape (n,)
+        Times of the compared poses, on the clock of the estimate.
+    distance_m : ndarray, shape (n,)
+        Distance along the reference, from the first compared pose.
+    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
+        Positions of the estimate before and after alignment, and of the reference.
+    position_error_m : ndarray, shape (n,)
     """
 
     alignment: AlignmentKind
@@ -89,35 +97,14 @@ class Score(Record, frozen=True, kw_only=True):
     rpe: tuple[RelativeError, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
-
-
-class Evaluation(Score, frozen=True, kw_only=True, eq=False):
-    """ATE and RPE of an estimate against a reference, with the error of each pose.
-
-    Attributes
-    ----------
-    estimate, reference : Trajectory
-        Complete trajectories, before association and alignment.
-    time_s : ndarray, shape (n,)
-        Times of the compared poses, on the clock of the estimate.
-    distance_m : ndarray, shape (n,)
-        Distance along the reference, from the first compared pose.
-    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
-        Positions of the estimate before and after alignment, and of the reference.
-    position_error_m : ndarray, shape (n,)
-    """
-
-    schema_type = Score
-    estimate: Trajectory
-    reference: Trajectory
-    time_s: Array
-    distance_m: Array
-    unaligned_m: Array
-    estimate_m: Array
-    reference_m: Array
-    position_error_m: Array
-
-    __repr__ = one_line_repr
+    estimate_track: NotWritten[Trajectory] = NOT_WRITTEN
+    reference_track: NotWritten[Trajectory] = NOT_WRITTEN
+    time_s: NotWritten[Array] = NOT_WRITTEN
+    distance_m: NotWritten[Array] = NOT_WRITTEN
+    unaligned_m: NotWritten[Array] = NOT_WRITTEN
+    estimate_m: NotWritten[Array] = NOT_WRITTEN
+    reference_m: NotWritten[Array] = NOT_WRITTEN
+    position_error_m: NotWritten[Array] = NOT_WRITTEN
 
 
 def evaluate(
@@ -199,8 +186,8 @@ def evaluate(
     if rpe_deltas is None:
         rpe_deltas = scores.default_deltas(distance_m, matched_estimate.time_s)
     return Evaluation(
-        estimate=estimate,
-        reference=reference,
+        estimate_track=estimate,
+        reference_track=reference,
         alignment=alignment,
         alignment_reason=reason,
         transform=transform,

@@ -42,7 +42,7 @@ TRUTH_NAMES = (
 def simulate_assigned(
     secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
-    """Simulate the flight of one student; return the log (ULog) and the right answers."""
+    """Simulate the flight of one student, and return the log (ULog) with the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
     log = flights.to_ulog(simulation, is_assessed=True)
@@ -95,19 +95,14 @@ def assign(
 ) -> tuple[AnswerKey, int]:
     """Write the log and the answer form of each student to a folder, and the answer key.
 
-    An existing log or form is never replaced: it must be identical. Students can be added to an
-    existing key; the entries of the other students must be unchanged.
+    Students can be added to an existing key. Existing files are not replaced: they must be equal.
 
     Parameters
     ----------
     secret : bytes or None
         None for the secret in the existing key, or for a new random secret.
-    count : int, optional
-        Number of injected faults per flight; drawn at random by default.
-    truth : bool
-        True if the logs of aisle flights contain the ground truth.
-    progress : callable
-        Called after each flight with the number of finished flights and the number of students.
+    count, truth
+        See :func:`~px4fuse.classroom.assignment.random_assignment.draw`.
 
     Returns
     -------
@@ -126,15 +121,11 @@ def assign(
     with inputs_not_registered():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
-    _check_extends(
-        key_file,
-        # students may have left the class, but the key of another class has no common student
-        key.kind == kind
-        and (
-            not answers
-            or not answers.keys().isdisjoint(normalise_text(s.student_id) for s in students)
-        ),
+    # some students may have left the class, but a key with none of them is of another class
+    is_same_class = not answers or not answers.keys().isdisjoint(
+        normalise_text(student.student_id) for student in students
     )
+    _check_extends(key_file, key.kind == kind and is_same_class)
     new_secret = key.secret
     if secret is None:
         new_secret = new_secret or secrets.token_urlsafe(24)

@@ -30,8 +30,6 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
 
     Attributes
     ----------
-    student_id, name : str
-        As in the class list.
     file, sha256 : str
         File name and SHA-256 of the student's log.
     scenario : dict
@@ -40,10 +38,6 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         Values of ``px4fuse simulate --mistake``; empty for a flight without an injected fault.
     truth : dict
         True values of the simulation that the log does not contain, for example ``sigma_z_m``.
-    difficulty : float or None
-        See :class:`px4fuse.classroom.assignment.random_assignment.AssignedFlight`.
-    form : FormTruth or None
-        Right answers to the student's answer form.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -63,16 +57,10 @@ class _Schema(msgspec.Struct, frozen=True):
 
 
 class AnswerKey(msgspec.Struct, frozen=True):
-    """Right answers for all students of a class, and the secret; written as JSON.
+    """Right answers for all students of a class, as a JSON file.
 
-    Attributes
-    ----------
-    kind : str
-        Kind of all flights: "aisle", "loop" or "mixed".
-    answers : tuple of Answer
-        Assigned flight and right answers of each student.
-    secret : str
-        Random secret that determined the flights; "" if the instructor chose and keeps the secret.
+    ``kind`` is "aisle", "loop" or "mixed". ``secret`` is the random secret that determined the
+    flights, or "" if the instructor chose the secret.
     """
 
     kind: _Text
@@ -87,7 +75,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """Return flight and right answers of a student; leading zeros of the id may be missing."""
+        """Return flight and right answers of a student; the id may lack leading zeros."""
         register = Register(Person(answer.student_id) for answer in self.answers)
         student_index = register.student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]

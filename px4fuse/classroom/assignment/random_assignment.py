@@ -34,11 +34,9 @@ DRAW_LABEL = "px4fuse assignment 2"
 COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
-# Minimum difficulty of an injected fault: smallest detectable size divided by the size in the
-# flight
-EASIEST_DIFFICULTY = 0.6
-# Maximum difficulty of an injected fault: its size in the flight is the smallest detectable size
-HARDEST_DIFFICULTY = 1.0
+# Range of the difficulty of an injected fault: smallest size that px4fuse detects, divided by the
+# size in the flight
+EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
 class AssignableMistake(Record, frozen=True):
@@ -46,23 +44,19 @@ class AssignableMistake(Record, frozen=True):
 
     Attributes
     ----------
-    mistake : str
-        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
     group : str
-        Two injected faults of one group are not assigned together: one would hide the other.
+        Two faults of one group are not assigned together, because one hides the other.
     detectable_size : float or None
         Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
-        (tests/studies/rates.csv); None for an injected fault without a size.
-    unit : str
-        Unit of ``detectable_size``, as in ``px4fuse simulate --mistake``.
+        (tests/studies/rates.csv); None for a fault without a size.
     is_smaller_easier : bool
         True if a smaller number is easier to detect.
     has_either_sign : bool
         True if the sign of the size is drawn at random.
     start_range_s : (float, float) or None
-        Earliest and latest start (s) of an injected fault that does not last the whole flight.
+        Earliest and latest start (s); None for a fault that lasts the whole flight.
     hidden_groups : tuple of str
-        Groups of injected faults that cannot be detected in a flight with this injected fault.
+        Groups of faults that this fault hides.
     """
 
     mistake: str
@@ -84,7 +78,7 @@ class AssignableMistake(Record, frozen=True):
     ) -> str:
         """Format the value of ``px4fuse simulate --mistake`` that gives this difficulty.
 
-        ``start_fraction``: position of the start time in ``start_range_s`` (0 to 1).
+        ``start_fraction`` selects the start time: 0 for the earliest start, 1 for the latest.
         """
         if self.detectable_size is None:
             return self.mistake
@@ -99,22 +93,16 @@ class AssignableMistake(Record, frozen=True):
 
 
 class DrawingRules(Record, frozen=True):
-    """Rules for drawing aisle flights or loops at random (``drawn.toml``).
+    """Possible injected faults of a kind of flight, and ranges of random numbers (``drawn.toml``).
 
-    Attributes
-    ----------
-    mistakes : tuple of AssignableMistake
-        Possible injected faults.
-    numbers : dict
-        Minimum, maximum and decimals of random numbers, by field of the scenario.
+    ``numbers`` are minimum, maximum and decimals, by field of the scenario.
     """
 
     mistakes: tuple[AssignableMistake, ...]
     numbers: dict[str, tuple[float, float, int]]
 
 
-_RULES_BY_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
-ASSIGNABLE_MISTAKES = {kind: rules.mistakes for kind, rules in _RULES_BY_KIND.items()}
+RULES_BY_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
 
 
 @dataclass(frozen=True)
@@ -128,9 +116,7 @@ class AssignedFlight:
     mistake_options : tuple of str
         Values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Largest difficulty of the injected faults: smallest detectable size divided by the size. A
-        flight without an injected fault is the most difficult, because all injected faults have to
-        be excluded.
+        Difficulty of the most difficult injected fault; HARDEST_DIFFICULTY without a fault.
     """
 
     scenario: Scenario
@@ -178,9 +164,8 @@ def draw(
     if count is None:
         count = bisect(list(accumulate(COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
     mistakes: list[AssignableMistake] = []
-    for mistake in sorted(
-        ASSIGNABLE_MISTAKES[kind], key=lambda each: draw_number(f"order {each.mistake}")
-    ):
+    rules = RULES_BY_KIND[kind]
+    for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):
         if len(mistakes) < count and all(map(mistake.is_detectable_with, mistakes)):
             mistakes.append(mistake)
     difficulties, options = [], []
@@ -193,35 +178,33 @@ def draw(
         options.append(mistake.format_option(difficulty, sign, draw_number(f"at {name}")))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * draw_number(name), decimals)
-        for name, (low, high, decimals) in _RULES_BY_KIND[kind].numbers.items()
+        for name, (low, high, decimals) in rules.numbers.items()
     }
     has_truth, seed = truth and kind == "aisle", int(draw_number("seed") * 2**32)
     scenario = make_scenario(kind, truth=has_truth, seed=seed, **numbers)
-    hardest = max(difficulties, default=HARDEST_DIFFICULTY)
-    return AssignedFlight(scenario, tuple(options), round(hardest, 2))
+    difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
+    return AssignedFlight(scenario, tuple(options), round(difficulty, 2))
 
 
-def encode_secret(text: str, where: str) -> bytes:
-    """Derive the key of the random numbers from the instructor's secret by scrypt (RFC 7914).
-
-    scrypt makes each guess of the secret slow. ``where`` names the option or file in errors.
+def encode_secret(text: str, source_name: str) -> bytes:
+    """Derive the key of the random numbers from the instructor's secret.
 
     Raises
     ------
     SettingsError
-        The secret is shorter than MIN_SECRET_LENGTH.
+        The secret is shorter than MIN_SECRET_LENGTH; the message names the file of the secret.
     """
-    stripped = text.strip()
-    if len(stripped) < MIN_SECRET_LENGTH:
+    secret = text.strip()
+    if len(secret) < MIN_SECRET_LENGTH:
         raise SettingsError(
-            f"{where}: the secret has only {len(stripped)} characters and can be guessed.",
+            f"{source_name}: the secret has only {len(secret)} characters and can be guessed.",
             f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
-            "generates one and stores it in the answer key.",
+            "generates a secret and stores it in the answer key.",
         )
-    return derive_key(stripped)
+    return derive_key(secret)
 
 
 def derive_key(secret: str) -> bytes:
-    """Derive the key of the random numbers from a secret."""
+    """Derive the key of the random numbers by scrypt (RFC 7914), which makes guessing slow."""
     text = secret.encode(errors="replace")
     return hashlib.scrypt(text, salt=DRAW_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

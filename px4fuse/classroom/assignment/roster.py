@@ -24,8 +24,8 @@ RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
 ROSTER_COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
-# Fields of a student that another list adds if the class list does not contain them
-ADDED_FIELDS = ("name", "email", "login", "submitted")
+# Fields of a student that are copied from another list if the class list does not contain them
+ADDED_FIELDS = ("name", "email", "login", "submitted", "extended_due")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
@@ -34,16 +34,9 @@ NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 class Person:
     """Student of the class.
 
-    Attributes
-    ----------
-    student_id, name, email : str
-        As in the class list.
-    login : str
-        Login on Blackboard or ILIAS.
-    numbers : dict
-        Number of the student on each learning platform, by name of the platform.
-    submitted : str
-        Submission time as in Moodle's worksheet.
+    ``login`` is the login on Blackboard or ILIAS, ``numbers`` the student's number by learning
+    platform, ``submitted`` the submission time in Moodle's worksheet, and ``extended_due`` the due
+    time of this student in the form of the option --due.
     """
 
     student_id: str
@@ -52,6 +45,7 @@ class Person:
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
     submitted: str = ""
+    extended_due: str = ""
 
     @property
     def file(self) -> str:
@@ -107,10 +101,10 @@ def read_roster(path: Path) -> tuple[Person, ...]:
             f"{path} contains {len(people)} students.",
             f"Give a class list with 1 to {MAX_STUDENTS} students.",
         )
-    stems: dict[str, Person] = {}
+    person_by_stem: dict[str, Person] = {}
     for person in people:
         stem = file_stem(person.student_id)
-        if stem is None or stems.setdefault(stem.casefold(), person) is not person:
+        if stem is None or person_by_stem.setdefault(stem.casefold(), person) is not person:
             student_text = one_line(person.student_id or person.name, 40)
             raise SettingsError(
                 f"{path}: the id of {student_text!r} cannot be used as a file name.",
@@ -136,12 +130,20 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
     submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
-    person = Person(student_id, name, cells["email"], cells["login"], numbers, submission_time)
+    person = Person(
+        student_id,
+        name,
+        cells["email"],
+        cells["login"],
+        numbers,
+        submission_time,
+        cells["extended_due"],
+    )
     return person if student_id or name or numbers else None
 
 
 class Register:
-    """Students of the class; other lists add missing data, but no further students."""
+    """Students of the class; data that the class list lacks are added from other lists."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
@@ -161,7 +163,7 @@ class Register:
         The first of these fields that matches exactly one student decides: platform number, id,
         email, login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
         """
-        criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
+        match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
                 (_is_same_text, lambda person, at=platform: person.numbers.get(at, ""), value)
                 for platform, value in other.numbers.items()
@@ -173,7 +175,7 @@ class Register:
             (_is_same_text, lambda person: person.login or person.student_id, other.login),
             (is_same_name, attrgetter("name"), other.name),
         )
-        for is_same, field_of, value in criteria:
+        for is_same, field_of, value in match_rules:
             matches = [
                 i for i, person in enumerate(self.people) if is_same(field_of(person), value)
             ]
@@ -211,10 +213,12 @@ def is_same_name(name: str, other_name: str) -> bool:
     words, other_words = (
         re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
     )
-    short, long = sorted((words, other_words), key=len)
-    rotated_words = ("".join(long[start:] + long[:start]) for start in range(len(long)))
-    is_joined = len(short) == 1 < len(long) and short[0] in rotated_words
-    return bool(short) and (sorted(words) == sorted(other_words) or is_joined)
+    short_name, long_name = sorted((words, other_words), key=len)
+    joined_names = (
+        "".join(long_name[start:] + long_name[:start]) for start in range(len(long_name))
+    )
+    is_joined = len(short_name) == 1 < len(long_name) and short_name[0] in joined_names
+    return bool(short_name) and (sorted(words) == sorted(other_words) or is_joined)
 
 
 def file_stem(student_id: str) -> str | None:

@@ -22,15 +22,7 @@ COLUMN_SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """CSV table with a header.
-
-    Attributes
-    ----------
-    head : tuple of str
-        Titles of the columns.
-    rows : tuple of tuple of str
-        Cells of each row, at least as many as titles.
-    """
+    """CSV table with column titles; each row has at least as many cells as there are titles."""
 
     path: Path
     head: tuple[str, ...]

@@ -47,9 +47,9 @@ MIN_REJECTED_FRACTION = 0.005
 MIN_RESET_M = 0.2
 # Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
 EKF2_START_S = 5.0
-# Ratio of both ends of a range of an answer
+# Ratio of the upper to the lower limit of a range from which the student chooses
 PREDICTION_RANGE_FACTOR = 1.35
-# Injected faults that require or allow an answer about the behaviour of EKF2, by rule and answer
+# Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
 BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
@@ -63,8 +63,7 @@ class TrueMistake(Record, frozen=True):
     low, high : float or None
         Smallest and largest size that is a right answer.
     from_s, until_s : float or None
-        Start and end of the injected fault (s since the first data); both None for the whole
-        flight.
+        Start and end (s since the first data); both None for the whole flight.
     """
 
     kind: str
@@ -90,19 +89,15 @@ class FormTruth(Record, frozen=True):
 
     Attributes
     ----------
-    mistakes : tuple of TrueMistake
-        Injected faults of the flight.
     sigma_z_m : float
         True noise of the position source (m, 1 σ).
-    kf, ekf2 : VerdictTruth
-        Verdicts on KF and EKF2.
-    ekf2_did, ekf2_did_also : tuple of str
-        Behaviour of EKF2 that a complete answer names, and further behaviour that is not wrong.
+    ekf2_did : tuple of str
+        Behaviours of EKF2 that the student has to name.
+    ekf2_did_also : tuple of str
+        Behaviours of EKF2 that the student may name without losing points.
     quantities : tuple
         Answers to :func:`px4fuse.results.answer_form.draw_questions`; None if the flight is too
         short.
-    predictions : tuple of (Prediction, str)
-        Questions on other simulations of the flight, with the right range.
     """
 
     mistakes: tuple[TrueMistake, ...]
@@ -143,29 +138,24 @@ def _compare(simulation: flights.Simulation) -> Comparison:
 def draw_predictions(
     simulation: flights.Simulation, draw_number: Callable[[str], float]
 ) -> tuple[tuple[Prediction, RangeName], ...]:
-    """Draw questions on other simulations of the flight, with the right ranges.
+    """Simulate the flight with one change, and return questions about the results.
 
-    The simulations need the seed of the flight, which only the instructor has. The position of the
-    right range is random, so that the ranges do not show the value.
-
-    Parameters
-    ----------
-    simulation : Simulation
-    draw_number : callable
-        Function that returns a random number in [0, 1) for a label.
+    Each question has five ranges and the right range. A student cannot compute the results, because
+    only the instructor has the seed of the flight. ``draw_number`` returns a random number in
+    [0, 1) for a label. The right range is drawn at random, so that the limits do not show it.
     """
     scenario = replace(simulation.scenario, truth=True)
     noise_name = "sigma_vio_m" if scenario.kind == "loop" else "sigma_uwb_m"
-    noisy = replace(scenario, **{noise_name: 2.0 * getattr(scenario, noise_name)})
-    variants = {
+    noisy_scenario = replace(scenario, **{noise_name: 2.0 * getattr(scenario, noise_name)})
+    changed_simulations = {
         "if the flight had no faults": flights.simulate(scenario),
         "if the position noise (1 σ) were twice as large": flights.simulate(
-            noisy, simulation.mistakes
+            noisy_scenario, simulation.mistakes
         ),
     }
     predictions: list[tuple[Prediction, RangeName]] = []
-    for change, variant in variants.items():
-        for name, summary in _compare(variant).main.filters.items():
+    for change, changed_simulation in changed_simulations.items():
+        for name, summary in _compare(changed_simulation).main.filters.items():
             truth = summary.truth
             values = {
                 "mean NIS": None if isinstance(summary, Unavailable) else summary.nis_mean,
@@ -177,13 +167,14 @@ def draw_predictions(
                 if value is None or not value > 0.0:
                     continue
                 text = f"{quantity} of {name.upper()} {change}"
-                right = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
-                place = right - 0.2 - 0.6 * draw_number(f"place {text}")
+                right_index = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
+                # the value is not near a limit of the right range
+                value_index = right_index - 0.2 - 0.6 * draw_number(f"place {text}")
                 first, second, third, fourth = (
-                    value * PREDICTION_RANGE_FACTOR ** (index - place) for index in range(4)
+                    value * PREDICTION_RANGE_FACTOR ** (index - value_index) for index in range(4)
                 )
-                limits = (first, second, third, fourth)
-                predictions.append((Prediction(text, limits), PREDICTION_RANGES[right]))
+                prediction = Prediction(text, (first, second, third, fourth))
+                predictions.append((prediction, PREDICTION_RANGES[right_index]))
     return tuple(predictions)
 
 
@@ -230,7 +221,7 @@ def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return EKF2 behaviours that a right answer must name, and others that it may name."""
+    """Return the behaviours of EKF2 that the student must name, and others that are not wrong."""
     size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
         [behaviour for behaviour, kinds in BEHAVIOUR_RULES[rule].items() if kinds & size_of.keys()]

@@ -1,7 +1,6 @@
-"""Checks that score a report: each check is a class of rubric items with its parameters as fields.
+"""Checks that score a report. Each class is one check; its fields are the parameters of the check.
 
-``rubric.toml`` describes the checks of the report (verified, number, answers, text), of the filter
-(tuning, consistent, clock) and of the loop.
+``rubric.toml`` explains all checks for the instructor.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import OrUnavailable, Share
 from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
 from px4fuse.filter.consistency import HorizontalNis
-from px4fuse.filter.time_offset import Clock
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.loop.model import Correction, CorrectionName, LoopResult
+from px4fuse.loop.model import CorrectedPath, CorrectionName, Loop
 from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
     TUNED_FIELDS,
@@ -32,7 +31,7 @@ from px4fuse.results.contract import (
     ReportedResults,
     to_plain,
 )
-from px4fuse.trajectory.evaluation import Score
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
@@ -62,9 +61,9 @@ class RubricItem(
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Command that makes the reports to which the item applies.
+        Reports to which the instructor restricts the item.
     command : {"any", "compare", "loop"}
-        Command that makes the reports that the check can score.
+        Reports that the check can score.
     needs_key : bool
         True if the item is used only with an answer key.
     by_hand : bool
@@ -84,7 +83,7 @@ class RubricItem(
         raise NotImplementedError
 
     def applies(self, kind: str, key: AnswerKey | None) -> bool:
-        """Return True if the item scores reports of the command ``kind`` (compare or loop)."""
+        """Return True if the item is used for reports of the command ``kind`` (compare or loop)."""
         has_key = key is not None or not self.needs_key
         return has_key and {self.report, self.command} <= {"any", kind}
 
@@ -92,10 +91,9 @@ class RubricItem(
 def fraction_for_deviation(deviation_factor: float, factor: float) -> float:
     """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
-    The fraction is 1 without deviation, and 0 from ``factor`` on. In between it decreases linearly
-    with the logarithm of the deviation.
+    The fraction decreases from 1 to 0 at ``factor``, linearly with the logarithm of the deviation.
 
-    >>> [round(fraction_for_deviation(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    >>> [round(fraction_for_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if deviation_factor <= 1.0:
@@ -133,7 +131,10 @@ class CheckInput:
 
     @cached_property
     def assigned_answer(self) -> Answer | None:
-        """Flight assigned to the student, by the id on the platform, else the id in the report."""
+        """Flight that was assigned to the student, according to the id on the learning platform.
+
+        If the platform states no id, the id in the report is used.
+        """
         if self.key is None:
             return None
         stated_id = shorten_text(self.results.student.id)
@@ -223,7 +224,6 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
     """Check that the numbers of the report agree with a new run of the analysis on its log."""
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return 1 for a verified report, else 0."""
         verdict = check_input.verdict
         reason_text = format_reason("".join(verdict.reasons[:1]))
         return float(verdict.status == "verified"), f"Verification: {verdict.status}{reason_text}."
@@ -232,8 +232,8 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
 class NumberItem(RubricItem, frozen=True, tag="number"):
     """Check that a number of the report is within bounds.
 
-    If ``path`` matches several numbers, the number with the fewest points counts. Outside the
-    bounds the points decrease linearly to zero at ``zero_at``; without ``zero_at`` they are zero.
+    Outside the bounds, the points decrease linearly to zero at ``zero_at``. If ``path`` matches
+    several numbers, the lowest score counts.
     """
 
     path: Text
@@ -245,9 +245,9 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
     advice: Text = ""
 
     def __post_init__(self) -> None:
-        bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
+        is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
         is_zero_outside = self.zero_at is None or self._excess(self.zero_at) >= 0.0
-        if not bounded or self.at_least > self.at_most or not is_zero_outside:
+        if not is_bounded or self.at_least > self.at_most or not is_zero_outside:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
@@ -260,11 +260,10 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         excess = self._excess(number)
         if excess <= 0.0:
             return 1.0
-        width = 0.0 if self.zero_at is None else self._excess(self.zero_at)
-        return max(1.0 - excess / width, 0.0) if width > 0.0 else 0.0
+        zero_excess = 0.0 if self.zero_at is None else self._excess(self.zero_at)
+        return max(1.0 - excess / zero_excess, 0.0) if zero_excess > 0.0 else 0.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return 1 within the bounds; outside, the score decreases linearly to 0 at ``zero_at``."""
         values = values_at(check_input.values, self.path)
         numbers = [
             (self._fraction(value), value, path) for path, value in values if is_number(value)
@@ -288,7 +287,6 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
     needs_key: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return the points of the answer form as a fraction, and the right and false answers."""
         form_result = check_input.form_points
         if isinstance(form_result, str):
             return 0.0, f"{capitalise_first(form_result)}."
@@ -308,7 +306,6 @@ class TextItem(RubricItem, frozen=True, tag="text"):
     by_hand: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return 0 points, which the instructor replaces."""
         if not check_input.results.student.notes.strip():
             return 0.0, "Your report has no text. Write a text and add it with --notes."
         return 0.0, "Your instructor reads your text and gives points for it."
@@ -328,7 +325,10 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, tag="tuning"):
-    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate."""
+    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate.
+
+    Outside the interval, the points decrease to zero at a deviation by ``factor``.
+    """
 
     command: ClassVar[str] = "compare"
 
@@ -336,48 +336,44 @@ class TuningItem(RubricItem, frozen=True, tag="tuning"):
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return 1 within the 95 % interval, and 0 if the noise is outside by ``factor``."""
-        return _score_tuning(check_input, self.setting, self.factor)
-
-
-def _score_tuning(check_input: CheckInput, name: Sigma, factor: float = 2.0) -> FractionAndReason:
-    comparison = check_input.comparison
-    label, unit, option = NOISE_SETTINGS[name]
-    chosen_value: float = getattr(comparison.settings, name)
-    horizontal_tuning = comparison.tuning.get(HORIZONTAL)
-    interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[name]}_interval", None)
-    if interval is None or interval[1] is None:
-        reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
-        return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
-    low, high = interval
-    if name == "sigma_z_m" and check_input.has_finding("source_may_drift", "source_drift"):
-        # innovations do not show the drift of a source, so SIGMA_Z may be as large as KF's error
-        high = max(high, _largest_source_error_m(comparison))
-    deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
-    side, factor_text, advice = "within", "", ""
-    if deviation_factor > 1.0:
-        side = "above" if chosen_value > high else "below"
-        factor_text = f" by a factor of {format_factor(deviation_factor)}"
-        advice = f" Set {option} within this interval."
-    return fraction_for_deviation(deviation_factor, factor), (
-        f"Your {label} {chosen_value:.3g} {unit} is {side} the 95 % interval of the "
-        f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}){factor_text}.{advice}"
-    )
+        comparison = check_input.comparison
+        label, unit, option = NOISE_SETTINGS[self.setting]
+        chosen_value: float = getattr(comparison.settings, self.setting)
+        horizontal_tuning = comparison.tuning.get(HORIZONTAL)
+        interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[self.setting]}_interval", None)
+        if interval is None or interval[1] is None:
+            reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
+            return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
+        low, high = interval
+        if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
+            # the estimate is too small for a source that drifts, because innovations show no drift
+            high = max(high, _largest_source_error_m(comparison))
+        deviation = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+        position, advice = "within", ""
+        if deviation > 1.0:
+            side = "above" if chosen_value > high else "below"
+            position = f"a factor of {format_factor(deviation)} {side}"
+            advice = f" Set {option} within this interval."
+        return fraction_for_deviation(deviation, self.factor), (
+            f"Your {label} {chosen_value:.3g} {unit} is {position} the 95 % interval of the "
+            f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
+        )
 
 
 def _largest_source_error_m(comparison: ComparisonResults) -> float:
     """Return the largest position RMSE or loop closure error (m) of KF; 0 without both."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
-    if isinstance(comparison.loop, LoopResult):
+    if isinstance(comparison.loop, Loop):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)
 
 
 class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
-    """Check that KF is consistent, or that no other SIGMA_A and SIGMA_Z would make it consistent.
+    """Check that KF is consistent, by the joint NIS of KF along north and east.
 
-    A reported σ that is too small or too large by ``factor`` or more gives no points.
+    If KF is not consistent, the points decrease to zero at a σ that is wrong by ``factor``. They do
+    not decrease if both SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates.
     """
 
     command: ClassVar[str] = "compare"
@@ -385,37 +381,40 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Score the verdict on the joint NIS of KF along north and east."""
         nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
             return 0.0, f"Your report has no verdict on KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
-        side = "small" if nis_result.nis_mean > 1.0 else "large"
+        deviation = "small" if nis_result.nis_mean > 1.0 else "large"
         factor = nis_result.sigma_error_factor
         fraction = fraction_for_deviation(factor, self.factor)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."
         )
-        if all(_score_tuning(check_input, name)[0] == 1.0 for name in NOISE_SETTINGS):
+        tuning_items = [TuningItem(title="", points=0.0, setting=name) for name in NOISE_SETTINGS]
+        if all(item.score(check_input)[0] == 1.0 for item in tuning_items):
             fraction = 1.0
             advice = (
                 "SIGMA_A and SIGMA_Z are within their 95 % intervals, so other settings do not "
                 "make KF consistent."
             )
         return fraction, (
-            f"The reported σ of KF is {format_factor(factor)} times too {side}. {advice}"
+            f"The reported σ of KF is {format_factor(factor)} times too {deviation}. {advice}"
         )
 
 
 class ClockItem(RubricItem, frozen=True, tag="clock"):
-    """Check that the applied time offset of the position source agrees with the estimated one.
+    """Check that the applied time offset of the position source agrees with the estimate.
 
-    ``undeterminable``: fraction of the points if the flight does not determine the offset. An
-    assigned log gives all points in this case, because the student could not choose the flight.
-    ``margin_s``: accepted distance (s) of the applied offset from its 95 % interval.
+    Attributes
+    ----------
+    margin_s : float
+        Maximum distance (s) of the applied offset from the 95 % interval of the estimate.
+    undeterminable : float
+        Fraction of the points if the student's own flight does not determine the offset.
     """
 
     command: ClassVar[str] = "compare"
@@ -424,12 +423,12 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
     undeterminable: Share = 0.5
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return 1 if applied and estimated time offset agree, else 0 or ``undeterminable``."""
         clock = check_input.comparison.clock
-        if not isinstance(clock, Clock) or not clock.is_determinable:
-            fraction = self.undeterminable if isinstance(clock, Clock) else 0.0
+        if not isinstance(clock, ClockOffset) or not clock.is_determinable:
+            fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
+            # the student could not choose the flight if the log was assigned
             return 1.0 if check_input.answer is not None else fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
         statement = (
@@ -454,22 +453,25 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
 # Maximum distance (m) between take-off and landing place of a closed loop
 MAX_CLOSED_LOOP_M = 0.5
-# Fraction of the points for a smaller ATE if the report has no ATE (no reference trajectory)
+# Fraction of the points for the condition on the ATE if a report without reference has no ATE
 NO_REFERENCE_FRACTION = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, tag="loop"):
-    """Check that the loop closure is measured and accepted, the path corrected and its ATE smaller.
+    """Check a loop: each of four conditions gives a quarter of the points.
 
-    Each of the four conditions gives a quarter of the points. If the vehicle did not land at the
-    take-off place (according to the answer key), a report without an accepted closure gets all
-    points.
+    1. The loop closure error is measured.
+    2. The loop closure is accepted.
+    3. The path is corrected.
+    4. The corrected path has a smaller ATE.
+
+    If the vehicle did not land at the take-off place according to the answer key, a report without
+    an accepted closure gets all points.
     """
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return the fraction of the points, and sentences about loop closure error and ATE."""
         loop = check_input.results.loop
-        closures = loop.closures if isinstance(loop, LoopResult) else ()
+        closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
         answer = check_input.answer
         landing_distance_m = answer.truth.get("closure_error_m", 0.0) if answer else 0.0
@@ -478,60 +480,62 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
                 f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
                 "so it is right that no loop closure was accepted."
             )
-        if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
-            unavailable = loop.true_end if isinstance(loop, LoopResult) else loop
+        if not isinstance(loop, Loop) or loop.closure_error_m is None:
+            unavailable = loop.true_end if isinstance(loop, Loop) else loop
             reason_text = format_reason(getattr(unavailable, "reason", ""))
             return 0.0, f"Your report contains no loop closure error{reason_text}."
         if loop.is_absolute_track:
-            reason = (
+            return 0.0, (
                 "The track in your report does not drift. Analyse odometry, for example LOG:vio."
             )
-            return 0.0, reason
+        fraction, comment = 0.25, "No loop closure was accepted."
+        if is_accepted:
+            correction_fraction, correction_comment = _score_corrections(loop.corrections)
+            fraction = 0.5 + correction_fraction
+            comment = f"A loop closure was accepted. {correction_comment}"
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
-        quarter_count, comment = _score_corrections(loop.corrections) if is_accepted else (-1.0, "")
-        return (2.0 + quarter_count) / 4.0, (
-            f"You measured a loop closure error of {error_text} after {path_text}. "
-            f"{'A' if is_accepted else 'No'} loop closure was accepted. {comment}"
-        ).rstrip()
+        return fraction, (
+            f"You measured a loop closure error of {error_text} after {path_text}. {comment}"
+        )
 
 
 def _score_corrections(
-    corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
+    corrections: Mapping[CorrectionName, OrUnavailable[CorrectedPath]],
 ) -> FractionAndReason:
-    """Return the number of quarters of the points: 1 for a corrected path, 2 for a smaller ATE."""
+    """Score conditions 3 and 4 of :class:`LoopItem`: 0.25 for each."""
     correction_names: tuple[CorrectionName, ...] = (
         "by_distance_plain",
         "by_distance",
         "pose_graph_gated",
     )
     paths = map(corrections.get, correction_names)
-    corrected_paths = [path for path in paths if isinstance(path, Correction)]
+    corrected_paths = [path for path in paths if isinstance(path, CorrectedPath)]
     if not corrected_paths:
         return 0.0, "The path was not corrected."
     ate_before_m = _ate_by_reference(corrections.get("uncorrected"))
-    pairs = [
+    ate_pairs_m = [
         (ate_before_m[name], after_m)
         for correction in corrected_paths
         for name, after_m in _ate_by_reference(correction).items()
         if ate_before_m.get(name)
     ]
-    if not pairs:
-        return 1.0 + NO_REFERENCE_FRACTION, (
+    if not ate_pairs_m:
+        return 0.25 + 0.25 * NO_REFERENCE_FRACTION, (
             "The path was corrected. The report contains no ATE: add a trajectory with --reference."
         )
-    before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
+    before_m, after_m = min(ate_pairs_m, key=lambda pair: pair[1] / pair[0])
     is_better = after_m < before_m
     advice = "" if is_better else " Explain why the correction increases the error."
-    return 1.0 + is_better, (
+    return 0.25 + 0.25 * is_better, (
         f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m.{advice}"
     )
 
 
 def _ate_by_reference(correction: object) -> dict[str, float]:
     """Return the ATE (m) of a corrected path against each reference trajectory."""
-    scores = correction.scores if isinstance(correction, Correction) else {}
+    scores = correction.scores if isinstance(correction, CorrectedPath) else {}
     return {
         name: score.ate.translation_m.rmse
         for name, score in scores.items()
-        if isinstance(score, Score)
+        if isinstance(score, Evaluation)
     }

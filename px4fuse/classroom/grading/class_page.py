@@ -6,18 +6,16 @@ redrawn PDFs in the folder ``reports/`` beside it.
 
 import math
 import statistics
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from px4fuse.classroom.assignment.sheet import format_cell_number
+from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Entry,
-    GradedReport,
-    Item,
     Override,
     list_titles,
 )
@@ -43,18 +41,8 @@ FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by i
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
-    """Format the class page as HTML; the same input gives the same text, without a date.
-
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Rows of the class table.
-    title : str
-        Title of the page.
-    made_with : str
-        Name and version of the program.
-    """
-    items, numbers = list_titles(entries)
+    """Format the class page as HTML; ``made_with`` is name and version of px4fuse."""
+    item_titles, number_titles = list_titles(entries)
     counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
     tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
     options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
@@ -71,10 +59,10 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             Column("Points", "number"),
             Column("Handed in", "line", visible_from="desk"),
             Column("Flags", "rank", visible_from="desk"),
-            *(Column(name, "number", "items") for name in items),
-            *(Column(name, "number", "numbers") for name in numbers),
+            *(Column(title, "number", "items") for title in item_titles),
+            *(Column(title, "number", "numbers") for title in number_titles),
         ),
-        rows=[_class_row(entry, items, numbers) for entry in entries],
+        rows=[_class_row(entry, item_titles, number_titles) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
@@ -96,23 +84,8 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=list(_item_statistics(reports)),
+        items=[(each, count_tenths(each.fractions, 1.0)) for each in analyse_items(reports)],
     )
-
-
-def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
-    """Yield title, distribution, mean and maximum of the points for each rubric item."""
-    items_by_title: dict[str, list[Item]] = defaultdict(list)
-    for report in reports:
-        for item in () if report.instructor_action else report.items:
-            items_by_title[item.title].append(item)
-    for title, items in items_by_title.items():
-        fractions = [item.points / item.max_points if item.max_points else 0.0 for item in items]
-        mean = statistics.fmean(item.points for item in items)
-        max_text = format_cell_number(max(item.max_points for item in items))
-        zero_count = sum(fraction <= 0.0 for fraction in fractions)
-        full_count = sum(fraction >= 1.0 for fraction in fractions)
-        yield title, count_tenths(fractions, 1.0), mean, max_text, zero_count, full_count
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
@@ -138,7 +111,7 @@ def _entry_tags(entry: Entry) -> list[str]:
     return tags + ["changed by instructor"] * bool(entry.overrides or entry.comment)
 
 
-def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
+def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
     report = entry.counted_report
     status = report.status if report else MISSING_REPORT
     style, symbol = STATUS_STYLES[status]
@@ -155,17 +128,21 @@ def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Ro
         _points_cell(entry),
         frame.text_cell(entry.submission_time, late_text),
         Cell("\n".join(entry.flags), float(count), "", "flags"),
-        *(frame.number_cell(points_by_title.get(name)) for name in items),
-        *(frame.number_cell(number_values.get(name)) for name in numbers),
+        *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
+        *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
     # overrides.csv identifies students by id or file; a row with pseudonym has neither
-    boxes = (_point_boxes(entry),) if entry.student_id or file else ()
+    point_boxes = (_point_boxes(entry),) if entry.student_id or file else ()
     # a row with pseudonym has no link, because the file name may contain the student's name
     links = (
         [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
-    link_sections = (frame.links_section("Report", links),)
-    return Row(cells, tuple(_entry_tags(entry)), (*_entry_details(entry), *boxes), link_sections)
+    return Row(
+        cells,
+        tuple(_entry_tags(entry)),
+        (*_entry_details(entry), *point_boxes),
+        (frame.links_section("Report", links),),
+    )
 
 
 def _entry_details(entry: Entry) -> Iterator[Section]:
@@ -228,10 +205,7 @@ def _points_cell(entry: Entry) -> Cell:
 
 
 def _point_boxes(entry: Entry) -> Section:
-    """Make input boxes for the rubric items that the instructor scores, and for the total.
-
-    Other rows of overrides.csv are included, because the downloaded file replaces overrides.csv.
-    """
+    """Make input boxes for the rubric items that the instructor scores, and for the total."""
     report = entry.counted_report
     max_by_title = {
         item.title: item.max_points
@@ -244,6 +218,7 @@ def _point_boxes(entry: Entry) -> Section:
         (title, max_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
+    # the page writes a new overrides.csv, so it must also contain the rows without boxes
     other_rows = [
         (title, override.points, override.comment)
         for title, override in entry.overrides.items()

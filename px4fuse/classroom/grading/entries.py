@@ -1,8 +1,6 @@
 """Rows of the class table: the report that counts, late deduction, and the instructor's points.
 
-Points that the instructor writes into ``overrides.csv`` replace the computed points. A late
-deduction is a percentage of the maximum points for each started day (or hour) after the due time,
-at most the maximum that the rule states. The total is never negative.
+Points that the instructor writes into ``overrides.csv`` replace the computed points.
 """
 
 import math
@@ -11,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, tzinfo
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -55,16 +53,10 @@ GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep",
 
 @dataclass(frozen=True)
 class LateRule:
-    """Rule of the instructor for the deduction of points for late submissions.
+    """Deduction of points for late submissions, as fraction of the maximum points.
 
-    Attributes
-    ----------
-    fraction_per_unit : float
-        Fraction of the maximum points that is deducted for each started unit of time.
-    unit_s : float
-        Unit of time: a day or an hour (s).
-    max_fraction : float
-        Largest fraction of the maximum points that is deducted.
+    ``fraction_per_unit`` is deducted for each started day or hour (``unit_s``), but at most
+    ``max_fraction``.
     """
 
     fraction_per_unit: float
@@ -85,18 +77,12 @@ class LateRule:
 
 @dataclass(frozen=True)
 class Course:
-    """Class list, answer key, logs and rules for grading, without the submissions.
+    """Class list, answer key, logs and rules for grading.
 
     Attributes
     ----------
-    rubric : Rubric
-        Items that give points.
-    key : AnswerKey or None
-        Right answers about each student's flight.
     logs : sequence of Path
-        Flight logs, and folders of logs. The SHA-256 identifies the log of a report.
-    title : str
-        Title of the class page; by default the title of the rubric.
+        Flight logs, and folders of logs.
     roster : tuple of Person or None
         Class list; by default the students of the answer key, else of the worksheets.
     worksheets : tuple of Sheet
@@ -105,12 +91,14 @@ class Course:
         Title of the grade column in the worksheets; "" if each has only one grade column.
     attempt : {"latest", "best", "first"}
         Report of a student that counts.
-    due : datetime or None
-        Due time, with time zone.
+    grace_s : float
+        Maximum delay (s) without a deduction.
+    scale : float or None
+        Maximum points on the learning platform; None to enter the points of the rubric.
+    question_count : int
+        Number of questions per student for an oral check.
     include_pending : bool
         True to count the points of reports on which the instructor still has to decide.
-    late_rule : LateRule or None
-        Deduction for late submissions.
     anonymous : bool
         True to show pseudonyms instead of names on the class page.
     """
@@ -124,6 +112,9 @@ class Course:
     column: str = ""
     attempt: Literal["latest", "best", "first"] = "latest"
     due: datetime | None = None
+    grace_s: float = 0.0
+    scale: float | None = None
+    question_count: int = 0
     late_rule: LateRule | None = None
     include_pending: bool = False
     anonymous: bool = False
@@ -138,8 +129,8 @@ class Course:
         return Register(people, *people_by_sheet)
 
 
-# Submitted report of a student: sort key (submission time, time of the zip entry), graded report,
-# and row of the class table as if the student had submitted only this report
+# Report of a student: sort key (submission time, time of the zip entry), graded report, and row of
+# the class table if only this report counts
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -233,10 +224,14 @@ def _make_attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """Make the row of the class table for a student with this report only, and its sort key."""
-    origin, due_time = submission.origin, course.due
-    platform = origin.platform.capitalize()
+    """Make the row of the class table that has this report as the only report of the student."""
+    origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
+    due_time = course.due
+    if due_time is not None and person.extended_due:
+        due_time = parse_due_time(
+            person.extended_due, f"extension of {one_line(person.student_id, 40)}:", due_time.tzinfo
+        )
     stated_time = origin.time or parse_moodle_time(person.submitted)
     time, zip_time = (
         time and add_time_zone(time, due_time) for time in (stated_time, submission.time)
@@ -244,7 +239,8 @@ def _make_attempt(
     late_s, flags = None, []
     if due_time is not None and time is not None:
         # UNIX times, because differences of datetimes ignore daylight saving within a time zone
-        late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
+        late_s = time.timestamp() - due_time.timestamp()
+        late_s = late_s if late_s > course.grace_s else 0.0
     elif origin.is_late:
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
@@ -289,11 +285,13 @@ def _points_after_deduction(attempt: Attempt) -> float:
 def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
     # several reports of one submission have the same time; points are the second sort key
-    ordered = sorted(attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission))
-    # preferred: reports without open action of the instructor, then other reports, then other files
-    with_report = [attempt for attempt in ordered if attempt[1].version]
+    sorted_attempts = sorted(
+        attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission)
+    )
+    # reports that the instructor does not have to check are preferred, and then files with a report
+    with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
     without_action = [attempt for attempt in with_report if not attempt[1].instructor_action]
-    eligible = without_action or with_report or ordered
+    eligible = without_action or with_report or sorted_attempts
     chosen_key, chosen_report, entry = {
         "latest": eligible[-1],
         # the first submission may contain several reports: the report with the most points
@@ -301,17 +299,17 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
         "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]
     flags = list(entry.flags)
-    other_reports = tuple(report for _, report, _ in ordered if report is not chosen_report)
+    other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
     forms = [report.form for sort_key, report, _ in eligible if sort_key == chosen_key]
     # students must not hand in several forms with different guesses, of which the best would count
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
     elif course.attempt == "best" and len({report.form for _, report, _ in with_report}) > 1:
-        flags.append(f"The student handed in {len(ordered)} reports with different answer forms.")
+        flags.append(f"The student handed in {len(attempts)} reports with different answer forms.")
     elif len(forms) > 1 and any(chosen_key):
         flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
-    for sort_key, report, _ in ordered:
+    for sort_key, report, _ in sorted_attempts:
         if (
             report in other_reports
             and sort_key >= chosen_key
@@ -340,13 +338,15 @@ def _apply_overrides(
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
             total = round(max(report.points - entry.deduction, 0.0), 2)
-    on_report, on_total = (own_overrides.get(title, Override()) for title in ("", TOTAL_TITLE))
+    report_override, total_override = (
+        own_overrides.get(title, Override()) for title in ("", TOTAL_TITLE)
+    )
     return replace(
         entry,
         counted_report=report,
         overrides=own_overrides,
-        comment="\n".join(filter(None, (on_report.comment, on_total.comment))),
-        total=total if on_total.points is None else on_total.points,
+        comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
+        total=total if total_override.points is None else total_override.points,
         flags=flags,
     )
 
@@ -400,7 +400,7 @@ def read_overrides(path: Path) -> Overrides:
         problem = ""
         if item_title in overrides[student]:
             item_text = one_line(item_title, 40) or "(whole report)"
-            problem = f"student {one_line(student, 40)} has another row for item {item_text}"
+            problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (value is None or value < 0.0 or not item_title):
             points_text = one_line(points, 20)
             problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
@@ -450,8 +450,8 @@ def match_overrides(
             elif title in matched_overrides[student_index]:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
-                limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
-                problem = f"student {student_text} cannot have more than {limit}"
+                limit_text = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
+                problem = f"student {student_text} cannot have more than {limit_text}"
             else:
                 matched_overrides[student_index][title] = override
             notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
@@ -479,10 +479,11 @@ def parse_late_rule(text: str) -> LateRule:
     return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction)
 
 
-def parse_due_time(text: str) -> datetime:
+def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
-    The default time zone is that of this computer. A date without a time means the end of the day,
+    ``name`` is the name of the time in errors. The default time zone is ``default_zone``, else that
+    of this computer. A date without a time means the end of the day,
     and a time without seconds the end of the minute.
 
     Raises
@@ -490,21 +491,23 @@ def parse_due_time(text: str) -> datetime:
     SettingsError
         The text is not a valid time.
     """
-    parts = text.split()
+    words = text.split()
     try:
-        zone = ZoneInfo(parts.pop()) if parts and parts[-1][0].isalpha() else None
-        time = datetime.fromisoformat("T".join(parts[:2]) + "".join(parts[2:]))
+        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_zone
+        time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
-            f"--due {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
+            f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
-    clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
-    if clock is None:
+    time_of_day = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    if time_of_day is None:
         time = time.replace(hour=23, minute=59)
-    if clock is None or clock[1] is None:
+    if time_of_day is None or time_of_day[1] is None:
         time = time.replace(second=59)
-    return time.replace(tzinfo=zone) if zone else time if time.tzinfo else time.astimezone()
+    if time.tzinfo is not None:
+        return time
+    return time.replace(tzinfo=zone) if zone else time.astimezone()
 
 
 def add_time_zone(time: datetime, due: datetime | None) -> datetime:

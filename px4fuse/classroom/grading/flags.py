@@ -21,7 +21,7 @@ from px4fuse.verification.model import Verdict
 
 # Minimum number of equal numbers in two answer forms for flagging them as copies
 MIN_SAME_NUMBERS = 3
-# Maximum relative difference of numbers that count as equal: a copy may have small changes
+# Maximum relative difference of two equal numbers: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
 # Minimum fraction of the log that --start and --end must include; otherwise a flag is raised
 MIN_SEGMENT_FRACTION = 0.5
@@ -91,7 +91,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers in an answer form, by (fault, "size" or "value") or ("", question)."""
+    """Return the numbers in an answer form, by the name of the answer."""
     if report.form is None:
         return {}
     answers: dict[tuple[str, str], object] = {
@@ -100,7 +100,7 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
         for name in ("size", "value")
     }
     answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
-    # a list of update numbers, which must be equal in all digits
+    # the digits of a list of update numbers are joined, so that equal lists are equal numbers
     answers |= {
         (f"q{index}", "value"): float("".join(f"{number:.0f}" for number in numbers))
         for index, numbers in enumerate(report.form.quantities)
@@ -110,9 +110,9 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two answer forms that have more than one digit.
+    """Count the equal numbers of two answer forms, without numbers of one digit.
 
-    Sizes and answers are equal within SAME_NUMBER_TOLERANCE, values of corrections exactly.
+    SAME_NUMBER_TOLERANCE is not used for the values of corrections and lists, which must be equal.
     """
     return sum(
         _count_digits(number) > 1
@@ -128,8 +128,7 @@ def _student_key(report: GradedReport) -> str:
 
 
 # Checks for equal contents of two reports: text of the flag, function that returns the compared
-# content, and function that returns an owner. Reports with the same owner are not flagged: two
-# reports of one student may be about the same log
+# content, and function that returns an owner. Two reports of one owner are not compared
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (

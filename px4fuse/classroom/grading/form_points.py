@@ -1,8 +1,8 @@
 """Points of a student's answer form (0 to 100), by comparison with the answer key.
 
-The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each false
-injected fault (named in the form, but not in the flight) costs points, and an injected fault that
-can be guessed without a measurement has points only with the correct size.
+The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each fault
+that the form names and the flight does not have (a false fault) costs points. A fault that can be
+guessed without a measurement has points only with the correct size.
 """
 
 import math
@@ -24,28 +24,28 @@ from px4fuse.results.answer_form import (
     StudentMistake,
 )
 
-# Fraction of the points for the diagnosis if the answer key has predictions: the diagnosis can be
-# copied from px4fuse, the predictions from no output
+# Fraction of the points for the diagnosis if the answer key has predictions: a student can copy the
+# diagnosis from the output of px4fuse, but not the predictions
 DIAGNOSIS_SHARE = 0.2
-# Points deducted for each false fault: named in the answer form, but not in the flight
+# Points deducted for each false fault
 FALSE_MISTAKE_POINTS = 10.0
-# Minimum number of false faults for which a form gets no points for right faults either
-MAX_FALSE_MISTAKES = 3
-# Fraction of the points if the answer form names a related injected fault
+# Number of false faults from which on the right faults give no points
+TOO_MANY_FALSE_MISTAKES = 3
+# Fraction of the points if the form names another fault of the same group in form_points.toml
 NEIGHBOUR_FRACTION = 0.4
 # Fraction of the points if the answer form names ekf2-noise instead of r-scale: both make R wrong
 SAME_NUMBER_FRACTION = 2.0 / 3.0
 # Fraction of the points if the answer form names a consequence of the injected fault
 EFFECT_FRACTION = 0.15
-# Relative error beyond the tolerance at which the size of a guessable fault has no points
-GUESSABLE_SIZE_RANGE = 0.08
-# Injected faults that can be guessed without a measurement: only a size that is nearly correct has
-# points, because the assigned sizes are close to each other
+# Injected faults that can be guessed without a measurement
 GUESSABLE_KINDS = frozenset(("open-end",))
+# Relative error over which the points for the size of a guessable fault decrease from full to zero:
+# the sizes that are assigned to students differ little
+GUESSABLE_SIZE_RANGE = 0.08
 ANY_BOUNDS = (-math.inf, math.inf)
-# Tolerance (s) of start and end of an injected fault
+# Minimum tolerance (s) of the start and the end of an injected fault
 TIME_TOLERANCE_S = 2.0
-# Tolerance of a late start or end of an injected fault, as a fraction of the time since the first
+# Tolerance of the start and the end of an injected fault, as fraction of the time since the first
 # data
 TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a computed number for full points
@@ -57,10 +57,10 @@ HALF_SIZE_TOLERANCE = 0.4
 
 
 class _CorrectionRule(NamedTuple):
-    """Parameter that corrects injected faults, with the fraction of the points for each fault.
+    """Correction of injected faults, and the fraction of the points for naming it.
 
-    ``right_values``: smallest and largest right value, or the name of a rule in
-    :func:`right_corrections`.
+    ``right_values`` are the smallest and the largest right value of the parameter, or the name of
+    bounds that :func:`right_corrections` computes.
     """
 
     parameter: str
@@ -76,24 +76,16 @@ PART_NAMES = tuple(POINTS_TABLE["weights"])
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points of a student's answer form.
+    """Points for each part of an answer form ("mistakes", "sizes", ...).
 
-    Attributes
-    ----------
-    points_by_part : mapping
-        Points of each part of the form: "mistakes", "sizes", "correction", ....
-    max_points_by_part : mapping
-        Maximum points of each part of the form.
-    feedback : tuple of str
-        Clauses for the student about right, missed and false faults.
-    is_named_by_mistake : mapping
-        True for each injected fault of the flight that the form names.
+    ``feedback`` are clauses for the student. ``is_kind_named`` is True for each injected fault of
+    the flight that the form names.
     """
 
     points_by_part: Mapping[str, float]
     max_points_by_part: Mapping[str, float]
     feedback: tuple[str, ...] = ()
-    is_named_by_mistake: Mapping[str, bool] = field(default_factory=dict)
+    is_kind_named: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def fraction(self) -> float:
@@ -107,7 +99,7 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     weights = POINTS_TABLE["weights_clean" if is_clean_named else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_mistakes = _match_mistakes(answers, truth)
-    if truth.mistakes and len(false_mistakes) < MAX_FALSE_MISTAKES:
+    if truth.mistakes and len(false_mistakes) < TOO_MANY_FALSE_MISTAKES:
         fractions |= _mistake_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
     # half of the points for the verdicts if no computed number is right, because most verdicts can
@@ -132,12 +124,12 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
             answers, truth
         )
     named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
-    is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
+    is_kind_named = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
     feedback = (
         *_mistake_feedback(matches, false_mistakes, is_clean_named),
         *_prediction_feedback(answers, truth),
     )
-    return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
+    return FormPoints(points_by_part, weights, feedback, is_kind_named)
 
 
 # Injected fault of the flight, best matching injected fault in the answer form, and fraction of the
@@ -153,7 +145,7 @@ def _mistake_feedback(
         yield f"your flight has no injected fault{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
-        right_answer = _describe_right_answer(mistake)
+        right_answer = describe_right_answer(mistake)
         if student_mistake is None:
             yield f"you did not name {mistake_text}: {right_answer}"
         elif student_mistake.kind != mistake.kind:
@@ -165,33 +157,33 @@ def _mistake_feedback(
         yield f"you named faults that your flight does not have: {kinds}"
 
 
-def _describe_right_answer(mistake: TrueMistake) -> str:
+def describe_right_answer(mistake: TrueMistake) -> str:
     """State the accepted size, the time and the panels of the report that show the fault."""
     texts = []
     if mistake.low is not None and mistake.high is not None:
         unit = next(iter(MISTAKES[mistake.kind].units), "")
         texts.append(f"accepted size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
-    starts = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
-    ends = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
-    texts.append(f"{starts}{ends}".strip() or "whole flight")
+    start_text = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
+    end_text = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
+    texts.append(f"{start_text}{end_text}".strip() or "whole flight")
     return ", ".join([*texts, f"shown in {' or '.join(panels(mistake.kind))}"])
 
 
 def _prediction_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
     """Yield a clause with the right range for each prediction that is wrong or missing."""
-    given = dict(enumerate(answers.predictions))
-    for index, (question, right) in enumerate(truth.predictions):
-        if given.get(index) != right:
+    named_ranges = dict(enumerate(answers.predictions))
+    for index, (question, right_range) in enumerate(truth.predictions):
+        if named_ranges.get(index) != right_range:
             yield (
-                f"p{index + 1}, {question.quantity}: range {right} is right, you gave "
-                f"{given.get(index) or 'none'}"
+                f"p{index + 1}, {question.quantity}: range {right_range} is right, you gave "
+                f"{named_ranges.get(index) or 'none'}"
             )
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match the injected faults of the flight with those in the form; also return unmatched ones.
+    """Match each injected fault with the fault in the form that gives the most points.
 
-    Equal injected faults are matched first, then related injected faults, then consequences.
+    Also return the false faults: those in the form that match no injected fault.
     """
     unmatched = [
         student_mistake
@@ -228,7 +220,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points for four parts of the form, as means over all faults."""
+    """Return the fraction of the points of the parts about faults, as means over all faults."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:
@@ -247,9 +239,10 @@ def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, floa
 
 
 def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
-    """Return the fraction of the points for the size of a fault: 1, 1/2 (close), 1/3, or 0.
+    """Return the fraction of the points for the size of a fault.
 
-    1/3 is for the wrong sign, and for the size of a related injected fault.
+    The fraction is 1 within the tolerance and 1/2 near it. It is 1/3 for a wrong sign, and if the
+    form names another fault with this size.
     """
     size = student_mistake.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
@@ -260,7 +253,7 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
         return is_right / 3.0
     deviation = abs(size - mistake.size) / abs(mistake.size)
     close_fraction = 0.5 * (deviation <= HALF_SIZE_TOLERANCE)
-    if mistake.kind in GUESSABLE_KINDS:  # decreases from 1 at the tolerance
+    if mistake.kind in GUESSABLE_KINDS:
         tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
         close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
     return _value_fraction(size, mistake.low, mistake.high, close_fraction)
@@ -301,11 +294,11 @@ def correction_fraction(
     return max(fractions, default=0.0)
 
 
-def _value_fraction(value: float, low: float, high: float, fallback: float) -> float:
-    """Return 1 for a value within bounds, 1/3 for a wrong sign, ``fallback`` for other values."""
+def _value_fraction(value: float, low: float, high: float, fraction_outside: float) -> float:
+    """Return 1 within the bounds, 1/3 for a wrong sign, and ``fraction_outside`` otherwise."""
     if low <= value <= high:
         return 1.0
-    return 1.0 / 3.0 if low <= -value <= high else fallback
+    return 1.0 / 3.0 if low <= -value <= high else fraction_outside
 
 
 # Parameter that corrects an injected fault, bounds of its right values, and fraction of the points
@@ -365,13 +358,14 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
 
 def _prediction_fraction(answers: Answers, truth: FormTruth) -> float:
     """Return the fraction of the points for predictions; guesses have no points on average."""
-    given = dict(enumerate(answers.predictions))
-    guessed_points = -1.0 / (len(PREDICTION_RANGES) - 1)
-    points = [
-        0.0 if not given.get(index) else 1.0 if given[index] == right else guessed_points
-        for index, (_, right) in enumerate(truth.predictions)
-    ]
-    return max(sum(points) / len(points), 0.0)
+    wrong_points = -1.0 / (len(PREDICTION_RANGES) - 1)
+    right_ranges = (right_range for _, right_range in truth.predictions)
+    points = (
+        1.0 if named_range == right_range else wrong_points
+        for named_range, right_range in zip(answers.predictions, right_ranges, strict=False)
+        if named_range
+    )
+    return max(sum(points) / len(truth.predictions), 0.0)
 
 
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:

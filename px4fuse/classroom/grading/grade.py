@@ -35,7 +35,6 @@ class GradeOutcome:
     reused_count : int
         Number of reports whose stored verification was loaded.
     written_paths : tuple of Path
-        Files and folders that were written.
     """
 
     entries: tuple[Entry, ...]
@@ -63,12 +62,8 @@ def grade(
     ----------
     paths : sequence of Path
         Submitted PDFs, and folders and zip files with PDFs.
-    course : Course
-        Class list, rubric, answer key and logs.
     output : Path
-        Folder for the class table (``class.csv``, ``class.html``), redrawn ``reports/``,
-        ``feedback/``, ``grades/`` for learning platforms, and ``records/``: stored verifications,
-        which make a second run fast. ``overrides.csv`` in this folder is read.
+        Folder for all outputs, and for ``overrides.csv`` with the instructor's points.
     processes : int, optional
         Number of processes; by default one per core.
     progress : callable
@@ -97,9 +92,9 @@ def grade(
             "" if student_index is None else course.register.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
-    rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    rubric_and_key, logs = (course.rubric, course.key), files_by_sha256(course.logs)
     records = output / RECORDS_FOLDER
-    grade_job = partial(grade_submission, *rules, logs, records, max_log_bytes.get())
+    grade_job = partial(grade_submission, *rubric_and_key, logs, records, max_log_bytes.get())
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
@@ -107,7 +102,7 @@ def grade(
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"
-                report, is_loaded = grade_unreadable(*rules, reason, FAILED_REMEDY), False
+                report, is_loaded = grade_unreadable(*rubric_and_key, reason, FAILED_REMEDY), False
             else:
                 report, is_loaded = result
             submission, student = found_submissions[index], report.student
@@ -116,8 +111,8 @@ def grade(
             graded_by_index[index] = replace(report, submission=submission.name, student=student)
             reused_count += is_loaded
             progress(len(graded_by_index), len(found_submissions))
-    graded = [graded_by_index[index] for index in range(len(found_submissions))]
-    entries, override_notes = build_entries(graded, found_submissions, course, overrides)
+    graded_reports = [graded_by_index[index] for index in range(len(found_submissions))]
+    entries, override_notes = build_entries(graded_reports, found_submissions, course, overrides)
     written_paths, class_notes = write_class(entries, course, output)
     all_notes = *notes, *unread_notes, *override_notes, *class_notes
     return GradeOutcome(entries, all_notes, reused_count, written_paths)
@@ -131,10 +126,9 @@ def grade_submission(
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify and score one submission, in a separate process.
+    """Read, verify and score a submission, given with the student id on the learning platform.
 
-    ``job`` is the submission and the student id according to the learning platform. Returns the
-    graded report, and True if a stored verification was loaded.
+    Return the graded report, and True if a stored verification was loaded.
     """
     max_log_bytes.set(max_bytes)
     submission, submitter_id = job

@@ -59,8 +59,6 @@ class Submission:
         Unique name for messages: one line of at most 200 characters.
     time : datetime or None
         Time of the zip entry, in an unknown time zone: time of the submission or of the download.
-    origin : ExportOrigin
-        Student and submission time according to a learning platform.
     """
 
     file: Path
@@ -87,32 +85,24 @@ class Item:
 
 @dataclass(frozen=True)
 class GradedReport:
-    """Submitted report with the result of its verification and its points.
+    """Submitted report with its points and the result of its verification.
 
     Attributes
     ----------
     submission : str
         Name of the submission in messages.
     student, student_id : str
-        Name and id of the student in the report; "" if missing.
-    verdict : Verdict
-        Result of the verification; "cannot verify" for a file that is not a report.
-    items : tuple of Item
-        Points for each item of the rubric.
-    flags : tuple of str
-        Sentences about suspicious contents, for the instructor.
+        Name and id in the report.
     instructor_action : str
-        Action of the instructor before the points count; "" if the points count.
-    form : Answers or None
-        Completed answer form of the student.
+        Decision that the instructor has to make before the points count; "" if they count.
     numbers : mapping
         Numbers of the report for the class table, by column title.
-    sha256, log_sha256, version : str
-        SHA-256 of the PDF and of its log, and px4fuse version that made the report.
-    notes : str
-        Text of the student.
+    version : str
+        Version of px4fuse that made the report.
     mistakes : mapping
         True for each injected fault of the assigned flight that the answer form names.
+    form_parts : tuple of Item
+        Points for each part of the answer form, of 100 points in total.
     redrawn_path : str
         Path of the PDF that px4fuse drew again from the log, relative to the class page.
     """
@@ -131,6 +121,7 @@ class GradedReport:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
+    form_parts: tuple[Item, ...] = ()
     redrawn_path: str = ""
 
     @property
@@ -140,12 +131,12 @@ class GradedReport:
 
     @property
     def points(self) -> float:
-        """Sum of the points of all items, whether they count already or not."""
+        """Sum of the points of all items, also while the instructor has to decide."""
         return sum(item.points for item in self.items)
 
     @property
     def counted_points(self) -> float | None:
-        """Sum of the points; None while the instructor has to act or to score an item."""
+        """Sum of the points; None while the instructor has to decide or to score an item."""
         return None if self.instructor_action or self.awaits_points else self.points
 
     @property
@@ -155,11 +146,13 @@ class GradedReport:
 
     @property
     def pending_reason(self) -> str:
-        """Action of the instructor before the points count; "" if they count."""
-        titles = [item.title for item in self.items if item.awaits_points]
-        return " ".join(
-            [self.instructor_action, *(f"Enter the points of {t}." for t in titles)]
-        ).strip()
+        """Actions of the instructor before the points count; "" if they count."""
+        actions = [
+            f"Enter the points of the item {item.title}."
+            for item in self.items
+            if item.awaits_points
+        ]
+        return " ".join([self.instructor_action, *actions]).strip()
 
     @property
     def max_points(self) -> float:
@@ -181,28 +174,18 @@ class Entry:
 
     Attributes
     ----------
-    student, student_id : str
-        Name and id from the class list; without a class list from the report or the platform.
     counted_report : GradedReport or None
         Report that counts, with the instructor's points; None without a submission.
     other_reports : tuple of GradedReport
         Reports of the same student that do not count, earliest first.
-    submission_time : str
-        Submission time of the report that counts; "" if unknown.
     late_s : float or None
         Submission time minus due time (s), 0 if in time; None if unknown.
     deduction : float
         Points deducted for late submission.
     overrides : mapping
         Points and comments of the instructor by rubric item, "total", or "" (the whole report).
-    comment : str
-        Comment of the instructor on the whole report.
     total : float or None
-        Grade in points; None without a submission, and while the instructor has to act.
-    max_points : float
-        Maximum points of the rubric.
-    flags : tuple of str
-        Sentences for the instructor about suspicious submissions and reports.
+        Grade in points; None without a submission, and while the instructor has to decide.
     """
 
     student: str

@@ -38,7 +38,9 @@ from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import html_text
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
+from px4fuse.classroom.grading.item_analysis import TITLES, analyse_items
 from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.spreadsheet import neutralise_formulas, neutralise_id
@@ -52,6 +54,7 @@ REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 NAMES_FILE = "names.csv"
+QUESTIONS_FILE = "questions.txt"
 NAMES_TITLES = ("pseudonym", "id", "name")
 # Columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
@@ -81,8 +84,9 @@ MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# Titles of feedback columns, which the learning platform reads as HTML, or as HTML or text
+# Titles of feedback columns that the learning platform reads as HTML
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
+# Titles of all feedback columns
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
 # Text in columns that Canvas computes and px4fuse therefore does not change
@@ -94,14 +98,11 @@ def write_class(
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Rows of the class table: the students in ``course.register`` first, in the same order.
+    The students in ``course.register`` are first in ``entries``, in the same order.
 
     Returns
     -------
-    written : tuple of Path
+    written_paths : tuple of Path
         Files and folders.
     notes : tuple of str
         Sentences about grades that could not be entered.
@@ -120,12 +121,20 @@ def write_class(
         entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
     )
     feedback_texts = [feedback_text(entry, title) for entry in entries]
-    contents = {"class.csv": csv_text(entries).encode()}
+    reports = [report for entry in entries if (report := entry.counted_report)]
+    item_rows = tuple(tuple(map(neutralise_formulas, i.row)) for i in analyse_items(reports))
+    contents = {
+        "class.csv": csv_text(entries).encode(),
+        "items.csv": ("\ufeff" + Sheet(Path(), TITLES, item_rows).text).encode(),
+    }
     if course.anonymous:
         page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
         contents[NAMES_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = html_text(page_entries, title, made_with).encode()
+    if course.question_count and course.key is not None:
+        text = questions_text(entries, course.key, course.question_count)
+        contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
     for stem, text in zip(stems, feedback_texts, strict=True):
@@ -134,24 +143,31 @@ def write_class(
     names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, entries, course.register, course.column, feedback_texts
+            sheet, entries, course.register, course.column, feedback_texts, course.scale
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    outputs = ["class.csv", "class.html", *[REPORTS_FOLDER] * has_redrawn, FEEDBACK_FOLDER]
+    outputs = [
+        "class.csv",
+        "items.csv",
+        "class.html",
+        *[REPORTS_FOLDER] * has_redrawn,
+        FEEDBACK_FOLDER,
+        *[QUESTIONS_FILE] * (QUESTIONS_FILE in contents),
+    ]
     outputs += [GRADES_FOLDER] * bool(course.worksheets) + [OVERRIDES_NAME]
     return tuple(output / name for name in outputs), tuple(notes)
 
 
 def _entry_identity(entry: Entry, stem: bool = False) -> str:
-    """Return id, else name, else file name: the identity of a row in all runs of grading."""
+    """Return the id of a student, or else the name, or else the file name."""
     file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy a redrawn report to ``reports`` and its diagnosis to ``feedback``; add the path."""
+    """Copy the redrawn report and its diagnosis to the output folder, for the class page."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
@@ -167,10 +183,9 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
+    """Replace names by pseudonyms, and sort by pseudonym; also return the table of names as CSV.
 
-    Pseudonyms are assigned in random order. A later run reads the pseudonyms from the table at
-    ``path``.
+    The pseudonyms in the table at ``path`` are kept, others are assigned in random order.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -215,6 +230,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             form=report.form,
             numbers=report.numbers,
             mistakes=report.mistakes,
+            form_parts=report.form_parts,
         )
     return Entry(
         pseudonym,
@@ -233,12 +249,9 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def csv_text(entries: Sequence[Entry]) -> str:
-    """Format the class table as CSV for spreadsheet programs; points include the instructor's.
-
-    The text begins with the byte order mark, by which Excel detects UTF-8, and lines end with CRLF.
-    """
-    items, numbers = list_titles(entries)
-    titles = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
+    """Format the class table as CSV for Excel and LibreOffice."""
+    item_titles, number_titles = list_titles(entries)
+    titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
     rows = []
     for entry in entries:
         report = entry.counted_report
@@ -253,8 +266,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
             entry.max_points,
             entry.deduction or None,
             entry.total,
-            *map(points_by_title.get, items),
-            *(report.numbers.get(title) if report else None for title in numbers),
+            *map(points_by_title.get, item_titles),
+            *(report.numbers.get(title) if report else None for title in number_titles),
             entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
             report.pending_reason if report else "",
@@ -270,7 +283,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
         ]
         cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
         rows.append(tuple(cells))
-    return "\ufeff" + Sheet(Path(), titles, tuple(rows)).text
+    # Excel detects UTF-8 by the byte order mark
+    return "\ufeff" + Sheet(Path(), tuple(map(neutralise_formulas, titles)), tuple(rows)).text
 
 
 # ------------------------------------------------------------------ feedback
@@ -310,11 +324,8 @@ def _wrap_text(text: str, indent: str = "") -> str:
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Return the index of the grade column in a table of a learning platform.
 
-    Parameters
-    ----------
-    column_title : str
-        Title of the column, for Canvas without the number in brackets; "" if the table has only one
-        grade column.
+    ``column_title`` is "" if the table has only one grade column. The title of a column in Canvas
+    may lack the number in brackets.
 
     Raises
     ------
@@ -349,25 +360,17 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 
 
 def fill_grades(
-    sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
+    sheet: Sheet,
+    entries: Sequence[Entry],
+    register: Register,
+    column: str,
+    feedback: Sequence[str],
+    scale: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
-    """Enter grades and feedback into a table of a learning platform.
+    """Enter grades and feedback into a copy of a table of a learning platform.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Rows of the class table: the students in ``register`` first, in the same order.
-    column : str
-        Title of the grade column; "" if the table has only one.
-    feedback : sequence of str
-        Feedback for the student of each row.
-
-    Returns
-    -------
-    filled_sheet : Sheet
-        Copy of the table with grades and feedback.
-    notes : tuple of str
-        Sentences about grades that were not entered, or are above the maximum.
+    The students in ``register`` are first in ``entries`` and ``feedback``, in the same order. The
+    notes are sentences about grades that were not entered, or that are above the maximum.
 
     Raises
     ------
@@ -388,14 +391,17 @@ def fill_grades(
         if student_index is None:
             continue
         found_people.add(student_index)
-        total = entries[student_index].total
+        total, rubric_maximum = entries[student_index].total, entries[student_index].max_points
         if total is None:
             continue
+        if scale is not None and rubric_maximum:
+            total = round(total * scale / rubric_maximum, 2)
         max_points = _max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
-                f"maximum of {max_points:.10g} on the platform. Increase the maximum there."
+                f"maximum of {max_points:.10g} on the platform. Increase the maximum there, or run "
+                f"grade again with --scale {max_points:.10g}."
             )
         row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
         if feedback_index is not None and feedback_index != grade_index:

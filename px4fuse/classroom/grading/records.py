@@ -1,8 +1,7 @@
-"""Stored verifications, which are valid until the report, a log or a version changes.
+"""Stored verifications of reports, by the SHA-256 of the PDF.
 
-The SHA-256 of the PDF identifies the record of its verification, which is valid while library
-versions and available input files are unchanged. The record contains no points, so that a new
-rubric needs no new verification.
+A stored verification is valid while library versions and available input files are unchanged. It
+contains no points, so a new rubric needs no new verification.
 """
 
 import hashlib
@@ -34,16 +33,9 @@ DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """Stored verification of one report.
+    """Stored verification: results attached to the PDF (JSON), and verdict without redrawn PDF.
 
-    Attributes
-    ----------
-    dependencies : dict
-        Library versions, and availability of input files, for which the record is valid.
-    results : str
-        Results attached to the PDF, as JSON.
-    verdict : Verdict
-        Result of the verification, without the redrawn PDF.
+    The record is valid while its ``dependencies`` are unchanged.
     """
 
     dependencies: dict[str, str]
@@ -65,8 +57,7 @@ def load_or_verify(
     logs : mapping
         Logs and other input files by SHA-256.
     assigned_hashes : frozenset of str
-        SHA-256 of the logs in the answer key. A report on one of these logs gets the verdict
-        "cannot verify", not "other log", if the log is not in ``logs``.
+        SHA-256 of the logs in the answer key.
 
     Returns
     -------
@@ -74,7 +65,6 @@ def load_or_verify(
         Results attached to the PDF; for a verified report on an assigned log, the results with
         px4fuse's diagnosis.
     verdict : Verdict
-        Result of the verification.
     is_loaded : bool
         True if a stored verification was loaded.
 
@@ -88,6 +78,7 @@ def load_or_verify(
         return *loaded, True
     results = read_report(pdf, "The file")
     dependencies = _dependencies(to_json(results), logs, assigned_hashes)
+    # the verdict is "cannot verify" instead of "other log" if an assigned log is not available
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verdict = verify(results, pdf, {} if is_log_missing else logs)
     files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
@@ -117,10 +108,7 @@ def diagnose_assigned(
 def _dependencies(
     results: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return library versions, and the availability of each input file of a report by SHA-256.
-
-    Availability: "available", "assigned" (in the answer key, but not available), or "missing".
-    """
+    """Return the version of each library, and the availability of each input file by SHA-256."""
     return _versions() | {
         name: "available" if name in logs else "assigned" if name in assigned_hashes else "missing"
         for name in sorted(set(file_hashes_in(results)))

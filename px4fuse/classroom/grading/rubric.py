@@ -26,6 +26,7 @@ from px4fuse.classroom.grading.checks import (
     shorten_text,
 )
 from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.form_points import FormPoints
 from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, Item
 from px4fuse.core.reading import read_text
 from px4fuse.core.text import one_line
@@ -57,8 +58,7 @@ if TYPE_CHECKING:
 else:
     # union of the item classes of all checks; the field "check" of the TOML file selects one
     AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# Rule for the points of a report: the instructor decides (pending), zero points, or the points
-# count
+# Rule for the points of a report. "pending": the instructor decides whether they count
 PointsRule = Literal["pending", "zero", "count"]
 
 
@@ -67,16 +67,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     Attributes
     ----------
-    title : str
-        Title of the class page.
     unverified : {"pending", "zero"}
         Rule for a report that could not be verified.
     others_log : {"pending", "zero", "count"}
         Rule for a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         Rule for a verified report with pages that differ from the redrawn report.
-    items : tuple of RubricItem
-        Items with points and check.
     """
 
     title: Text = ""
@@ -145,9 +141,8 @@ def score_report(
 ) -> GradedReport:
     """Score a report, and add flags and the action that the instructor has to take.
 
-    Items for reports of another command are omitted, and without an answer key also items that need
-    a key. The caller adds the file name of the report. ``submitter_id`` is the student id according
-    to the learning platform; it takes precedence over the id in the report.
+    ``submitter_id`` is the student id according to the learning platform. It takes precedence over
+    the id in the report.
     """
     check_input = CheckInput(results, verdict, key, submitter_id)
     points_rule, rule_text = _points_rule(check_input, rubric)
@@ -165,6 +160,8 @@ def score_report(
             Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
         )
     form_result, values = check_input.form_points, check_input.values
+    if isinstance(form_result, str) or not check_input.is_own_log:
+        form_result = FormPoints({}, {})
     return GradedReport(
         "",
         student.name,
@@ -178,9 +175,12 @@ def score_report(
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=rule_text if points_rule == "pending" else "",
-        mistakes={}
-        if isinstance(form_result, str) or not check_input.is_own_log
-        else form_result.is_named_by_mistake,
+        mistakes=form_result.is_kind_named,
+        form_parts=tuple(
+            Item(name, form_result.points_by_part[name], max_points, "")
+            for name, max_points in form_result.max_points_by_part.items()
+            if max_points
+        ),
         form=check_input.form if isinstance(check_input.form, Answers) else None,
         numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
         log_sha256=log_sha256(results),
@@ -190,7 +190,10 @@ def score_report(
 
 
 def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
-    """Return the rule for the points of a report, and the reason or the instructor's action."""
+    """Decide whether the points of a report count.
+
+    Return the rule, with the reason for zero points or the action of the instructor.
+    """
     verdict = check_input.verdict
     reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":

@@ -48,8 +48,8 @@ MAX_ZIP_ENTRIES = 10_000
 MAX_DIRECTORY_BYTES = 4_000_000
 # Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: they may share their data
 MAX_TOTAL_BYTES = 4_000_000_000
-# Maximum ratio of unpacked to packed size of a zip entry: a PDF is compressed already, so that its
-# ratio is near 1
+# Maximum ratio of unpacked to packed size of a zip entry: the ratio of a PDF is near 1, because it
+# is compressed already
 MAX_COMPRESSION_RATIO = 100
 # Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
@@ -147,13 +147,15 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         )
     if not submission_by_path:
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
-    ordered = sorted(
+    submissions = sorted(
         submission_by_path.values(),
         key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
     )
-    names = make_unique(_short_name(submission.name) for submission in ordered)
-    renamed = [replace(each, name=name) for each, name in zip(ordered, names, strict=True)]
-    return tuple(add_origins(renamed, origin_by_number)), tuple(notes)
+    names = make_unique(_short_name(submission.name) for submission in submissions)
+    named_submissions = [
+        replace(each, name=name) for each, name in zip(submissions, names, strict=True)
+    ]
+    return tuple(add_origins(named_submissions, origin_by_number)), tuple(notes)
 
 
 def add_origins(
@@ -163,11 +165,7 @@ def add_origins(
 
     All files of an export (zip file or top-level folder) are from the platform whose pattern
     matches most of them, so that a student cannot imitate the file names of another platform.
-
-    Parameters
-    ----------
-    origin_by_number : mapping
-        Students and times of Gradescope, by submission number.
+    ``origin_by_number`` contains students and times by Gradescope's submission number.
     """
     exports = [item.file if item.zip_entry else item.name.partition("/")[0] for item in submissions]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
@@ -365,10 +363,10 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
     >>> parse_origin("report.pdf") == ExportOrigin()
     True
     """
-    tail = name
-    while tail:
+    remaining_path = name
+    while remaining_path:
         for platform in platforms:
-            match = PLATFORMS[platform].match(tail)
+            match = PLATFORMS[platform].match(remaining_path)
             if match is None:
                 continue
             fields = {key: value or "" for key, value in match.groupdict().items()}
@@ -384,7 +382,7 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
             expected_count = platform in ("moodle", "blackboard")
             is_imitated = len(_PLATFORM_NAMES.findall(name)) > expected_count
             return ExportOrigin(platform, person, time, bool(fields.get("late")), is_imitated)
-        tail = tail.partition("/")[2]
+        remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_SUBMITTER
 
 

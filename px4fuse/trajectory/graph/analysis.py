@@ -10,7 +10,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import GraphSolution, solve
+from px4fuse.trajectory.graph.solver import Solution, solve
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -36,7 +36,7 @@ class Graph(Record, frozen=True, kw_only=True):
         Source of the initial poses.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
-    solutions : mapping from key of :data:`SOLUTIONS` to GraphSolution
+    solutions : mapping from key of :data:`SOLUTIONS` to Solution
     """
 
     name: str
@@ -45,7 +45,7 @@ class Graph(Record, frozen=True, kw_only=True):
     edges: Count
     initialised: str
     gates: tuple[GateResult, ...] | Unavailable
-    solutions: Mapping[str, GraphSolution]
+    solutions: Mapping[str, Solution]
 
 
 def analyse_graph(

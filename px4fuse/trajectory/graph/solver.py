@@ -6,8 +6,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record
+from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
@@ -43,8 +42,8 @@ _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
 
 
-class GraphSolution(Record, frozen=True, kw_only=True):
-    """Solution of a pose graph for results.json: costs, iterations and dropped edges.
+class Solution(Record, frozen=True, kw_only=True):
+    """Solution of a pose graph: costs, iterations, dropped edges, poses and weights.
 
     Attributes
     ----------
@@ -60,6 +59,10 @@ class GraphSolution(Record, frozen=True, kw_only=True):
         cost although the last step still changed it by more than the tolerance.
     dropped : int
         Number of edges with a weight below 0.5.
+    poses : ndarray, shape (n, 3) or (n, 7)
+        Optimised poses; the first pose is unchanged.
+    weights : ndarray, shape (m,)
+        Factors on the information of each edge, from 0 (ignored) to 1.
     """
 
     cost_initial: NotNegative
@@ -67,24 +70,8 @@ class GraphSolution(Record, frozen=True, kw_only=True):
     iterations: Count
     converged: bool
     dropped: Count
-
-
-class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
-    """Solution of a pose graph, with poses and weights.
-
-    Attributes
-    ----------
-    poses : ndarray, shape (n, 3) or (n, 7)
-        Optimised poses; the first pose is unchanged.
-    weights : ndarray, shape (m,)
-        Factors on the information of each edge, from 0 (ignored) to 1.
-    """
-
-    schema_type = GraphSolution
-    poses: Array
-    weights: Array
-
-    __repr__ = one_line_repr
+    poses: NotWritten[Array] = NOT_WRITTEN
+    weights: NotWritten[Array] = NOT_WRITTEN
 
 
 @dataclass(frozen=True)

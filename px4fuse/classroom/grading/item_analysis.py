@@ -1,0 +1,77 @@
+"""Difficulty and discrimination of each rubric item, form part and injected fault."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from px4fuse.classroom.assignment.sheet import format_cell_number
+from px4fuse.classroom.grading.model import GradedReport
+
+# Minimum number of reports for a correlation of points
+MIN_REPORTS = 5
+TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
+
+
+@dataclass(frozen=True)
+class ItemStatistics:
+    """Points of all reports for a rubric item, a part of the answer form, or an injected fault.
+
+    Attributes
+    ----------
+    fractions : tuple of float
+        Points of each report divided by the maximum; for a fault 1 if the form names it, else 0.
+    max_points : float
+    discrimination : float or None
+        Correlation with the other points of the same reports (point-biserial for a fault). A value
+        near 0 or below shows that good students do not get more points here than others.
+    """
+
+    title: str
+    fractions: tuple[float, ...]
+    max_points: float
+    discrimination: float | None
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Cells of the row of ``items.csv``, in the order of TITLES."""
+        numbers = (
+            len(self.fractions),
+            round(float(np.mean(self.fractions)), 3),
+            self.discrimination,
+            self.fractions.count(0.0),
+        )
+        return (self.title, *map(format_cell_number, numbers))
+
+
+def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
+    """Compute the statistics of all items, without reports that need a decision of the instructor.
+
+    Rubric items are first, then parts of the answer form, then injected faults.
+    """
+    points: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
+    for report in reports:
+        if report.instructor_action:
+            continue
+        for place, prefix, items in (
+            (0, "", report.items),
+            (1, "Answer form: ", report.form_parts),
+        ):
+            total = sum(item.points for item in items)
+            for item in items:
+                row = item.points, item.max_points, total - item.points
+                points[place, f"{prefix}{item.title}"].append(row)
+        for kind, is_named in report.mistakes.items():
+            points[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+    statistics = []
+    for (_, title), rows in sorted(points.items(), key=lambda item: item[0][0]):
+        item_points, max_points, other_points = np.transpose(rows)
+        discrimination = None
+        if len(rows) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
+            discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
+        fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
+        statistics.append(
+            ItemStatistics(title, tuple(fractions.tolist()), float(max(max_points)), discrimination)
+        )
+    return statistics

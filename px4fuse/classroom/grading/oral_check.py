@@ -1,0 +1,81 @@
+"""Questions for a short oral check of a student, from the student's own form and flight."""
+
+import textwrap
+from collections.abc import Iterator, Sequence
+
+from px4fuse.classroom.assignment.key import AnswerKey
+from px4fuse.classroom.assignment.truth import FormTruth
+from px4fuse.classroom.grading.form_points import describe_right_answer, panels
+from px4fuse.classroom.grading.model import Entry
+from px4fuse.core.text import one_line
+from px4fuse.results.answer_form import MISTAKES, NO_MISTAKE_KIND, PANELS, Answers
+
+# Question to the student, and the answer that the instructor can expect
+Question = tuple[str, str]
+
+
+def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
+    """Format the questions to all students with an answer form, each with the expected answer."""
+    lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
+    for entry in entries:
+        report = entry.counted_report
+        answer = key.of_log(report.log_sha256) if report else None
+        if report is None or report.form is None or answer is None or answer.form is None:
+            continue
+        lines += ["", one_line(f"{entry.display_name} {entry.student_id}", 100)]
+        questions = [*ask_about_form(report.form, answer.form)][:count]
+        for number, (question, expected) in enumerate(questions, start=1):
+            for label, text in ((f"{number}. ", question), ("   Expected: ", expected)):
+                lines += textwrap.wrap(text, 96, initial_indent=label, subsequent_indent="   ")
+    return "\n".join(lines) + "\n"
+
+
+def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
+    """Yield questions on a completed form: errors first, then right answers and the verdict."""
+    named = {mistake.kind: mistake for mistake in form.mistakes}
+    true_kinds = [mistake.kind for mistake in truth.mistakes]
+    flight_text = ", ".join(true_kinds) or "no fault"
+    for kind in named:
+        if kind in (*true_kinds, NO_MISTAKE_KIND):
+            continue
+        yield (
+            f"You named {kind} ({MISTAKES[kind].description}). Which panel would show this fault, "
+            "and does the panel of your report show it?",
+            f"{' or '.join(panels(kind))}; it does not show it. The flight has {flight_text}.",
+        )
+    for mistake in truth.mistakes:
+        description, student_mistake = MISTAKES[mistake.kind].description, named.get(mistake.kind)
+        if student_mistake is None:
+            yield (
+                f"Your flight also has this fault: {description}. Show it in your report, and "
+                "state its size and time.",
+                f"{describe_right_answer(mistake)}.",
+            )
+            continue
+        blind_panels = [panel for panel in PANELS if panel not in panels(mistake.kind)]
+        yield (
+            f"You named {mistake.kind} ({description}). Show it in your report, and name a panel "
+            "that cannot show it, with the reason.",
+            f"{describe_right_answer(mistake)}. Cannot show it, for example: "
+            f"{' or '.join(blind_panels[:2])}.",
+        )
+    given_ranges = dict(enumerate(form.predictions))
+    for index, (prediction, right_range) in enumerate(truth.predictions):
+        given_range = given_ranges.get(index) or "none"
+        yield (
+            f"For the {prediction.quantity} you gave range {given_range}. Is this more or less "
+            "than in your flight, and why?",
+            f"Range {right_range} is right. The reason names what the change does to the "
+            "innovations, and to R or Q.",
+        )
+    for name, given, verdict in (
+        ("KF", form.verdict_kf, truth.kf),
+        ("EKF2", form.verdict_ekf2, truth.ekf2),
+    ):
+        factor = verdict.factor
+        factor_text = "" if factor is None else f" (σ is wrong by a factor of {factor:.2g})"
+        yield (
+            f"Your verdict on {name} is: {given or 'blank'}. Which number of the report shows it?",
+            f"{verdict.verdict or 'No verdict is possible'}{factor_text}: the mean NIS, and the "
+            "ratio of the errors to the reported σ.",
+        )

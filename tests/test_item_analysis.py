@@ -1,0 +1,85 @@
+"""Item analysis of a class, and questions for an oral check."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from class_tools import entry, graded_report
+
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
+from px4fuse.classroom.grading.item_analysis import analyse_items
+from px4fuse.classroom.grading.model import Item
+from px4fuse.classroom.grading.oral_check import ask_about_form, questions_text
+from px4fuse.results.answer_form import Answers, Prediction, StudentMistake
+
+POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
+REPORTS = [graded_report(f"{n}.pdf", *row) for n, row in enumerate(POINTS.tolist())]
+TRUTH = FormTruth(
+    (TrueMistake("nlos", 10.0, 8.5, 11.5), TrueMistake("yaw", 20.0, 17.0, 23.0)),
+    0.1,
+    VerdictTruth("overconfident", 2.0),
+    VerdictTruth("consistent"),
+    ("normal",),
+    (),
+    (1.0, 2.0, 3.0),
+    ((Prediction("mean NIS of KF if the flight had no faults", (1.0, 2.0, 3.0, 4.0)), "c"),),
+)
+FORM = Answers(
+    log_sha256="a" * 64,
+    mistakes=(StudentMistake("nlos"), StudentMistake("dropout")),
+    verdict_kf="consistent",
+    predictions=("a",),
+)
+
+
+def test_item_discrimination_is_correlation_with_other_points() -> None:
+    for index, item in enumerate(analyse_items(REPORTS)):
+        others = POINTS.sum(axis=1) - POINTS[:, index]
+        expected = np.corrcoef(POINTS[:, index], others)[0, 1]
+        assert item.discrimination == pytest.approx(expected, abs=0.005)
+        assert item.fractions == pytest.approx(tuple(POINTS[:, index] / 10.0))
+
+
+def test_item_analysis_of_four_reports_has_no_discrimination() -> None:
+    assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
+
+
+def test_item_analysis_lists_form_parts_and_faults() -> None:
+    reports = [
+        replace(each, form_parts=(Item("sizes", n, 15.0, ""),), mistakes={"nlos": n > 1})
+        for n, each in enumerate(REPORTS)
+    ]
+    *_, sizes, fault = analyse_items(reports)
+    assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
+    assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
+    assert fault.row[1:3] == ("5", "0.6")
+
+
+def test_item_analysis_excludes_reports_with_open_decision() -> None:
+    reports = [replace(each, instructor_action="Decide.") for each in REPORTS]
+    assert analyse_items(reports) == []
+
+
+def test_oral_questions_ask_about_false_and_missed_faults_first() -> None:
+    questions = [*ask_about_form(FORM, TRUTH)]
+    assert "You named dropout" in questions[0][0]
+    assert "nlos, yaw" in questions[0][1]
+    assert "You named nlos" in questions[1][0]
+    assert "accepted size 8.5 to 11.5 %" in questions[1][1]
+    assert "Your flight also has this fault" in questions[2][0]
+    assert "you gave range a" in questions[3][0]
+    assert "Range c is right" in questions[3][1]
+    assert "overconfident (σ is wrong by a factor of 2)" in questions[4][1]
+
+
+def test_oral_questions_page_lists_n_questions_of_each_student() -> None:
+    key = AnswerKey("aisle", (Answer("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
+    report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
+    rows = (replace(entry("s1", "Ada", 5.0), counted_report=report), entry("s2", "Max", None))
+    text = questions_text(rows, key, 2)
+    assert text.count("Expected:") == 2
+    assert "Ada s1" in text
+    assert "Max" not in text
