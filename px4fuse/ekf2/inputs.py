@@ -12,13 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-<<<<<<< HEAD
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Span
-||||||| 2f144066
-from px4fuse.core.notebook_display import one_line_repr
-=======
->>>>>>> main
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
