@@ -42,7 +42,7 @@ napoleon_use_rtype = False
 
 
 def draw_layers() -> Figure:
-    """Draw the package layers of ``pyproject.toml``. A layer imports only from the layers below."""
+    """Draw the package layers of the import-linter contract in ``pyproject.toml``."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     figure = Figure(figsize=(7.0, 0.34 * len(layers)))

@@ -1,9 +1,7 @@
-"""Write one Markdown page per finding: meaning, example, action, rates and thresholds.
+"""Write one Markdown page per finding: meaning, example, action, error rates and thresholds.
 
-``write(folder)`` writes ``index.md`` and ``<id>.md`` for each finding. The thresholds are read from
-the source code of the detectors, the rates from ``tests/studies/rates.csv``. The examples are
-findings on simulated flights. ``px4fuse explain`` prints them from a file; update this file after a
-change of messages or rates:
+The examples are findings on simulated flights. ``px4fuse explain`` prints them from a file. Update
+this file after a change of messages or rates:
 
     python docs/findings_pages.py --examples
 """
@@ -53,12 +51,15 @@ from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
-slow, louder = partial(coloured, tau_s=0.5, share=1.0), partial(two_levels, factor=3.0)
+slow_errors, larger_errors = (
+    partial(coloured, tau_s=0.5, share=1.0),
+    partial(two_levels, factor=3.0),
+)
 UNEQUAL_M = (0.05, 0.2, 0.1)
 FINDINGS = ROOT / "px4fuse" / "findings"
 EXAMPLES = FINDINGS / "examples.json"
 # Findings that no simulated flight shows; their examples in examples.json are of recorded flights
-FROM_LOGS = {
+IDS_FROM_LOGS = {
     "ekf2_acceleration_bad",
     "ekf2_bias_at_limit",
     "ekf2_gps_delay_wrong",
@@ -68,8 +69,8 @@ FROM_LOGS = {
     "source_height_only",
     "source_relocalises",
 }
-LABEL_WIDTH = 26  # characters per line of an axis label
-# By finding id: simulated faults (option --mistake) and KF settings with which the finding appears
+LABEL_LENGTH = 26  # characters per line of an axis label
+# Simulated faults (option --mistake) and KF settings with which a finding appears, by finding id
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
@@ -104,28 +105,33 @@ class Example:
 
 def examples() -> dict[str, Example]:
     """Return an example of each finding, by finding id."""
-    made: dict[str, Example] = {}
+    example_by_id: dict[str, Example] = {}
 
-    def keep(found: Any, flight: str, analysis: Analysis | None = None) -> None:
-        for one in found:
-            made.setdefault(one.id, Example(one, flight, analysis))
+    def add_examples(findings: Any, flight: str, analysis: Analysis | None = None) -> None:
+        for finding in findings:
+            example_by_id.setdefault(finding.id, Example(finding, flight, analysis))
 
-    for name, (typed, settings) in SIMULATED.items():
-        flight = simulate_flight(Scenario(passes=4, seed=2), parse(typed))
+    for name, (faults, settings) in SIMULATED.items():
+        flight = simulate_flight(Scenario(passes=4, seed=2), parse(faults))
         analysis = explain(compare(flight, Settings(**settings)))
-        command = " ".join(["px4fuse simulate", *(f"--mistake {each}" for each in typed)])
+        command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
-        compared = f", analysed with `compare {' '.join(options)}`" if options else ""
-        found = [one for one in find(analysis) if one.id == name]
-        keep(found, f"a flight of `{command}`{compared}", analysis)
-    for model in (slow, partial(held, share=0.2), partial(white, sigma=UNEQUAL_M), louder):
+        settings_text = f", analysed with `compare {' '.join(options)}`" if options else ""
+        findings = [finding for finding in find(analysis) if finding.id == name]
+        add_examples(findings, f"a flight of `{command}`{settings_text}", analysis)
+    for model in (
+        slow_errors,
+        partial(held, share=0.2),
+        partial(white, sigma=UNEQUAL_M),
+        larger_errors,
+    ):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
-        known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
-        analysis = explain(compare(laid_over(flight, known, model, 10.0, 2), Settings()))
-        found = [one for one in find(analysis) if one.id.startswith("source_")]
-        keep(
-            found,
+        true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
+        analysis = explain(compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings()))
+        findings = [finding for finding in find(analysis) if finding.id.startswith("source_")]
+        add_examples(
+            findings,
             "a simulated flight with position errors of `tests/studies/source_errors.py`",
             analysis,
         )
@@ -134,54 +140,59 @@ def examples() -> dict[str, Example]:
         ({"source": "sample_logs/aisle_uwb.ulg:ekf2"}, ""),
         ({"source": "sample_logs/loop_slam.tum"}, ""),
     ):
-        made_of = {**options, "source": f"{ROOT}/{options['source']}"}
-        typed = f"px4fuse loop {options['source']} {drift_option}".strip()
-        keep(find_loop(px4fuse.close_loop(**made_of)), f"the result of `{typed}`")
-    keep(convention_examples(), "a simulated loop flight with changed positions")
-    keep(value_examples(), "a simulated flight of the tests")
+        loop_options = {**options, "source": f"{ROOT}/{options['source']}"}
+        command = f"px4fuse loop {options['source']} {drift_option}".strip()
+        add_examples(find_loop(px4fuse.close_loop(**loop_options)), f"the result of `{command}`")
+    add_examples(convention_examples(), "a simulated loop flight with changed positions")
+    add_examples(value_examples(), "a simulated flight of the tests")
     _, odometry = laps(3, 5, OdometryNoise())
-    wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
-    found = find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong)))
-    keep(found, "simulated odometry of three laps")
+    wrong_closure = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
+    findings = find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong_closure)))
+    add_examples(findings, "simulated odometry of three laps")
     _, odometry = laps(3, 5, OdometryNoise(5.0, 20.0))
-    keep(find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "simulated odometry of three laps")
+    add_examples(
+        find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "simulated odometry of three laps"
+    )
     parts = [
-        HeadingPart(2.0 * n, 2.0 * n + 2.0, at, 1.0) for n, at in enumerate((-36.0, -20.0, -9.0))
+        HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
+        for n, angle_deg in enumerate((-36.0, -20.0, -9.0))
     ]
-    still = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
-    drifts = replace(still, heading=combine_heading_parts(tuple(parts), 1e-9, "positions"))
-    keep(source_frame.detect(drifts), "a heading estimate with simulated drift")
+    aisle_analysis = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
+    drift_analysis = replace(
+        aisle_analysis, heading=combine_heading_parts(tuple(parts), 1e-9, "positions")
+    )
+    add_examples(source_frame.detect(drift_analysis), "a heading estimate with simulated drift")
     flight = aisle_flight(duration_s=60.0)
-    not_fused = aid_log(enabled=steps((0.0, 1.0)))
-    not_fused = replace(not_fused, samples=outage_free(not_fused, 20.0, 41.0))
-    changed = aid_log()
-    changed.samples.loc[35.0:, "innovation_east"] -= 0.7
-    aids = {"gnss_pos": not_fused, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
-            "mag_heading": changed}  # fmt: skip
-    evaluated = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    keep(find_aids(evaluated), "simulated innovations of the aiding sources")
+    log_with_outage = aid_log(enabled=steps((0.0, 1.0)))
+    log_with_outage = replace(log_with_outage, samples=outage_free(log_with_outage, 20.0, 41.0))
+    changed_log = aid_log()
+    changed_log.samples.loc[35.0:, "innovation_east"] -= 0.7
+    aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
+            "mag_heading": changed_log}  # fmt: skip
+    aid_analysis = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
+    add_examples(find_aids(aid_analysis), "simulated innovations of the aiding sources")
     for fault in FAULTS:
-        if fault.id in made:
+        if fault.id in example_by_id:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
         analysis = (with_noises if fault.id in TUNED_IDS else unexplained)(comparison)
-        found = [one for one in find(analysis) if one.id == fault.id]
-        keep(found, "a simulated flight of the tests", analysis)
-    return made
+        findings = [finding for finding in find(analysis) if finding.id == fault.id]
+        add_examples(findings, "a simulated flight of the tests", analysis)
+    return example_by_id
 
 
 def detectors() -> dict[str, str]:
     """Return the module name of the detector of each finding, by finding id."""
-    found: dict[str, str] = {}
+    module_by_id: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
         if path.stem in ("cause_grouping", "cause_text", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in TITLES:
-                found.setdefault(str(node.value), path.stem)
-    # These modules compose finding ids from a filter or parameter name and a suffix
-    composed = {
+                module_by_id.setdefault(str(node.value), path.stem)
+    # These modules form finding ids from a filter or parameter name and a suffix
+    module_by_composed_id = {
         name: stem
         for name in TITLES
         for stem, prefixes in {
@@ -190,18 +201,20 @@ def detectors() -> dict[str, str]:
         }.items()
         if name.startswith(prefixes)
     }
-    return found | composed
+    return module_by_id | module_by_composed_id
 
 
-def thresholds(stem: str) -> Iterator[str]:
+def thresholds(module_name: str) -> Iterator[str]:
     """Yield a Markdown table row with value and comment of each constant of a detector module."""
-    source = (FINDINGS / f"{stem}.py").read_text(encoding="utf-8")
+    source = (FINDINGS / f"{module_name}.py").read_text(encoding="utf-8")
     lines = source.splitlines()
     for node in ast.parse(source).body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant | ast.UnaryOp):
             name, line = ast.unparse(node.targets[0]), lines[node.lineno - 1]
-            before = lines[node.lineno - 2]
-            comment = line.partition("  # ")[2] or (before[2:] if before.startswith("# ") else "")
+            line_above = lines[node.lineno - 2]
+            comment = line.partition("  # ")[2] or line_above.removeprefix("# ") * (
+                line_above.startswith("# ")
+            )
             if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
                 comment = comment.replace("|", r"\|")
                 yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
@@ -240,22 +253,22 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield f"## Example\n\nFinding of severity *{finding.severity}* on {example.flight}:\n"
         yield f"> {finding.message}\n"
         if example.analysis is not None:
-            file = picture(name, example, folder)
+            file = save_picture(name, example, folder)
             yield f"![Position, innovations and σ of the example flight]({file})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
-    found = list(rate_rows(name))
-    if found:
+    rates = list(rate_rows(name))
+    if rates:
         yield "## False alarms and detection\n"
         yield "The rates were measured on simulated flights. In flights with the fault `none`,"
         yield "each finding is a false alarm.\n"
         yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
         yield "|---|---|---|---|---|"
-        yield "\n".join(found) + "\n"
-    stem = detectors()[name]
-    rows = list(thresholds(stem))
+        yield "\n".join(rates) + "\n"
+    module_name = detectors()[name]
+    rows = list(thresholds(module_name))
     if rows:
         yield "## Thresholds\n"
-        yield f"The file `px4fuse/findings/{stem}.py` contains these thresholds."
+        yield f"The file `px4fuse/findings/{module_name}.py` contains these thresholds."
         yield "Some of them belong to other findings.\n"
         yield "| name | value | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
@@ -266,18 +279,20 @@ def links(names: Iterable[str]) -> str:
     return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
-def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
-    """Return message, action and rates of each finding, which ``px4fuse explain`` prints."""
+def packaged_examples(simulated: Mapping[str, Example]) -> dict[str, Any]:
+    """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
     table, recorded, contents = measured_rates(), load_examples(), {}
     for name in TITLES:
         rows = table[table["finding"] == name]
-        clean = rows[rows["condition"] == "none"]
-        example = made[name].finding if name in made else recorded[name]
+        fault_free_rows = rows[rows["condition"] == "none"]
+        example = simulated[name].finding if name in simulated else recorded[name]
         contents[name] = {
             "message": example.message,
             "remedy": example.remedy,
-            "clean_flights": int(clean["flights"].sum()),
-            "false_alarms": round(float((clean["flights"] * clean["rate"]).sum())),
+            "clean_flights": int(fault_free_rows["flights"].sum()),
+            "false_alarms": round(
+                float((fault_free_rows["flights"] * fault_free_rows["rate"]).sum())
+            ),
             "detection": {
                 row.condition: row.rate for row in rows[rows["condition"] != "none"].itertuples()
             },
@@ -291,16 +306,16 @@ def write_examples() -> None:
     EXAMPLES.write_text(f"{text}\n", encoding="utf-8")
 
 
-def picture(name: str, example: Example, folder: Path) -> str:
+def save_picture(name: str, example: Example, folder: Path) -> str:
     """Plot position, innovations and σ along the axis of an example; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
-    shown = example.analysis.axes.get(str(axis)) or example.analysis.main
+    axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
-        panel.draw(axes, shown.in_flight)
-        axes.set_ylabel(fill(panel.title, LABEL_WIDTH))
-    panels[0].set_title(shown.axis.name)
+        panel.draw(axes, axis_analysis.in_flight)
+        axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
+    panels[0].set_title(axis_analysis.axis.name)
     panels[-1].set_xlabel("time (s)")
     figure.savefig(folder / f"{name}.png", dpi=70)
     return f"{name}.png"
@@ -322,12 +337,11 @@ def write(folder: Path) -> None:
     """Write the index and the pages of all findings."""
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
-    made = examples()
-    assert set(made) | FROM_LOGS >= set(TITLES), (
-        f"these findings have no example: {sorted(set(TITLES) - set(made) - FROM_LOGS)}"
-    )
+    example_by_id = examples()
+    missing_ids = set(TITLES) - set(example_by_id) - IDS_FROM_LOGS
+    assert not missing_ids, f"these findings have no example: {sorted(missing_ids)}"
     for name in TITLES:
-        text = "\n".join(page(name, made.get(name), folder))
+        text = "\n".join(page(name, example_by_id.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
         pyplot.close("all")
     (folder / "index.md").write_text("\n".join(index()), encoding="utf-8")

@@ -28,8 +28,7 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() with their data types: fields of FilterSummary and ErrorsAgainstTruth, with
-# nis_low and nis_high for nis_band
+# Columns of table() with their data types
 COLUMNS = {
     "count": "Int64",
     "nis_mean": "float64",
@@ -107,11 +106,11 @@ def compare(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     arguments = locals()  # names of the arguments are fields of the request
-    known = get_args(request.AxisName)
+    known_axes = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown_axes := set(axis_names).difference(known):
+    if unknown_axes := set(axis_names).difference(known_axes):
         raise SettingsError(
-            f"`axes` {unknown_axes.pop()!r} is unknown. Choose from {', '.join(known)}."
+            f"`axes` {unknown_axes.pop()!r} is unknown. Choose from {', '.join(known_axes)}."
         )
     if isinstance(log, Flight) and (position, system) != (None, None):
         raise SettingsError(
@@ -134,14 +133,10 @@ def compare(
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
-    """Return a table of the main numbers of an analysis.
+    """Return a table of the main numbers, with one row per axis and filter ("kf", "ekf2").
 
-    Returns
-    -------
-    DataFrame
-        One row per axis and filter ("kf", "ekf2"), which are the index. Columns have the names of
-        the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE and
-        NEES are against ground truth. A number that is not available is NaN.
+    Columns have the names of the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of
+    the mean NIS. RMSE and NEES are against ground truth. Missing numbers are NaN.
     """
     rows = {
         (axis_name, filter_name): _summary_row(summary)
@@ -249,12 +244,7 @@ def close_loop(
 def write_report(analysis: Analysis, path: Pathlike) -> Path:
     """Write the PDF report of an analysis, and its JSON results in the same folder.
 
-    Parameters
-    ----------
-    analysis : Analysis
-        Analysis from :func:`px4fuse.compare`.
-    path : str or Path
-        Path of the report, which ends in .pdf.
+    The path of the report ends in .pdf.
 
     Raises
     ------
@@ -266,21 +256,17 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     target = _require_suffix(path, ".pdf")
-    record = results(_require_request(analysis), analysis)
-    text = to_json(record)
-    write_all({target: render(analysis, record, text), target.with_suffix(".json"): text.encode()})
+    contract_results = results(_require_request(analysis), analysis)
+    text = to_json(contract_results)
+    pdf = render(analysis, contract_results, text)
+    write_all({target: pdf, target.with_suffix(".json"): text.encode()})
     return target
 
 
 def write_page(analysis: Analysis, path: Pathlike) -> Path:
     """Write the interactive web page of an analysis, as ``px4fuse explore`` does.
 
-    Parameters
-    ----------
-    analysis : Analysis
-        Analysis from :func:`px4fuse.compare`.
-    path : str or Path
-        Path of the page, which ends in .html.
+    The path of the page ends in .html.
 
     Raises
     ------

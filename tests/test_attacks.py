@@ -214,7 +214,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
     ),
     "another version": (
         set_value("0.1.1", "provenance", "px4fuse"), "cannot verify",
-        "Verify it with px4fuse 0.1.1.",
+        "Verify the report with px4fuse 0.1.1.",
     ),
     "another schema": (
         set_value("9.9", "schema", "version"), "cannot verify",

@@ -16,7 +16,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.flight.log import Dropout
-from px4fuse.flight.model import FlightMode, Reset
+from px4fuse.flight.model import Reset
 from px4fuse.report import cover, event_marks, flight, panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
@@ -24,8 +24,6 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
-
-MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 100.0, "Land"))
 
 
 def document(
@@ -50,7 +48,7 @@ def eventful() -> Analysis:
         ekf2=Estimator(rejected_fraction=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
         dropouts=(Dropout(50.0, 0.5),),
     )
-    made = replace(made, airborne=((20.0, 90.0),), modes=MODES)
+    made = replace(made, airborne=((20.0, 90.0),))
     comparison = compare(made, start_s=5.0, end_s=95.0)
     return with_noises(comparison)
 
@@ -58,22 +56,21 @@ def eventful() -> Analysis:
 def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
     labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
     assert labels == [
-        "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",
+        "on the ground", "gap in position source", "log dropout",
         "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
     ]  # fmt: skip
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
     limits = axes.get_xlim(), axes.get_ylim()
-    event_marks.draw_marks(axes, eventful, with_mode_names=True)
+    event_marks.draw_marks(axes, eventful)
     axes.autoscale()
     assert (axes.get_xlim(), axes.get_ylim()) == limits
     axes.lines[0].remove()
     bands = [c for c in axes.collections if isinstance(c, PolyCollection)]
     spans = [[tuple(path.vertices[[0, 2], 0]) for path in band.get_paths()] for band in bands]
     assert spans == [
-        [(40.0, 95.0)], [(5.0, 20.0), (90.0, 95.0)], list(eventful.events.gaps), [(50.0, 50.5)],
+        [(5.0, 20.0), (90.0, 95.0)], list(eventful.events.gaps), [(50.0, 50.5)],
     ]  # fmt: skip
-    assert {text.get_text() for text in axes.texts} == {"Offboard", "Land"}
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
     assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))

@@ -82,19 +82,19 @@ def agreeing(
 
 
 @pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "expected"), [
-    (agreeing(s=1.049), 0.0, 0.0, True, "the correlation 1.0000 of"),
+    (agreeing(s=1.049), 0.0, 0.0, True, "have a correlation of 1.0000"),
     (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 times"),
     (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 times"),
-    (agreeing(0.95), 0.0, 0.0, True, "the correlation 0.9500"),
-    (agreeing(published_m=0.09), 0.0, 0.0, True, "the correlation 1.0000 of"),
+    (agreeing(0.95), 0.0, 0.0, True, "a correlation of 0.9500"),
+    (agreeing(published_m=0.09), 0.0, 0.0, True, "have a correlation of 1.0000"),
     (agreeing(published_m=0.11), 0.0, 0.0, False, "published positions differ by 0.11 m"),
     # enough digits to show the excess
     (agreeing(published_m=0.1028), 0.0, 0.0, False, "differ by 0.103 m RMS (limit 0.1"),
     (agreeing(published_m=0.10004), 0.0, 0.0, False, "differ by 0.10004 m"),
-    (agreeing(0.949), 0.0, 0.04, False, "the correlation 0.9490"),
+    (agreeing(0.949), 0.0, 0.04, False, "a correlation of 0.9490, below"),
     # with many rejections, shares and NIS decide
-    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples (log 10.0%)"),
-    (agreeing(0.5), 0.06, 0.1, True, "single innovations differ"),
+    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 10.0%"),
+    (agreeing(0.5), 0.06, 0.1, True, "single innovations are not compared"),
     (agreeing(0.5), 0.25, 0.19, False, "limits "),
     (agreeing(0.5), 0.125, 0.1875, False, "limits "),
     (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),
@@ -125,7 +125,7 @@ def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
                        rejected_fraction_replayed=0.3)  # fmt: skip
     found = with_logged_rejections(own_gate, logged_gate)
     assert found.good is good
-    assert found.reason.startswith("with EKF2's logged rejections: ")
+    assert found.reason.startswith("in a replay with EKF2's logged rejections, ")
     assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
     assert found.axes == logged_gate.axes
     # above half of the positions the published position is not tested, but the correlation is

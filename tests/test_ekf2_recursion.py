@@ -157,7 +157,7 @@ def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)
     with pytest.raises(
-        SettingsError, match=r"in PX4 v1\.14 the fusion horizon follows from the largest delay"
+        SettingsError, match=r"in PX4 v1\.14 the largest delay parameter is the delay"
     ):
         replay_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
     assert replay_settings(model, []) == ()

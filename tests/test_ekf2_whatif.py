@@ -87,7 +87,7 @@ def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
         by_name = {step.name: step for step in axis.steps}
         # properties that do not differ between the filters change nothing
         assert by_name["measurement noise"].position_moved_m < 1e-6
-        assert by_name["gate, missed samples and resets"].position_moved_m < 1e-6
+        assert by_name["rejections and resets"].position_moved_m < 1e-6
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
         assert {step.name for step in largest} == {"process noise", OUTPUT}
         last = axis.steps[-1].position_rmse_to_truth_m
@@ -202,7 +202,7 @@ def test_what_if_summary_combines_north_and_east() -> None:
 
 
 def test_what_if_with_late_samples_adds_a_note():
-    for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
+    for by_delay, remedy in ((False, ". Increase EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, uses_delay_as_horizon=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
         one: Any = SimpleNamespace(

@@ -152,7 +152,7 @@ def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
 def test_alignment_of_straight_line_allows_only_yaw(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
-        with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
+        with pytest.raises(TrajectoryError, match=r"perpendicular.*`alignment` yaw"):
             fit_alignment(x, y, kind)  # type: ignore[arg-type]
     assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
 
@@ -361,7 +361,7 @@ def test_evaluate_straight_track_with_vertical_z_aligns_by_yaw() -> None:
     straight = replace(aisle, kind="slam", frame="camera", position_m=x)
     with pytest.raises(TrajectoryError, match="`alignment` yaw"):
         evaluate(straight, aisle, alignment="se3")
-    assert "along a line" in evaluate(straight, aisle).warnings[0]
+    assert "perpendicular" in evaluate(straight, aisle).warnings[0]
 
 
 def test_evaluate_camera_track_removes_mounting_rotation() -> None:

@@ -1,11 +1,8 @@
-"""Events for the time axes: flight modes as read, gaps, dropouts, resets, rejections."""
+"""Events for the time axes: gaps, dropouts, resets, rejections."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pandas as pd
 import pytest
 from comparisons import compare
 from exchange import replace
@@ -13,38 +10,7 @@ from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.comparison.flight_events import collect_events, source_gaps
 from px4fuse.flight.log import Dropout
-from px4fuse.flight.model import Flight, FlightMode, Reset, Unavailable
-from px4fuse.readers import read_log
-from px4fuse.readers.common import mode_spans
-
-MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
-
-
-def test_flight_modes_of_sample_log_have_expected_times(sample_flight: Flight) -> None:
-    assert [mode.name for mode in sample_flight.modes] == ["Offboard", "Land", "Offboard"]
-    _, land, last = sample_flight.modes
-    assert (land.start_s, land.end_s) == pytest.approx((120.48, 128.74), abs=0.01)
-    assert last.end_s == sample_flight.log.duration_s
-    # the landing of the land detector is within the Land mode
-    assert land.start_s < sample_flight.airborne[-1][1] < land.end_s
-
-
-def test_flight_modes_of_mavlink_recording_equal_those_of_ulog(
-    sample_flight: Flight, sample_log: Path
-) -> None:
-    recording = read_log(sample_log.with_suffix(".tlog"))
-    assert [mode.name for mode in recording.modes] == ["Hold", "Offboard", "Land", "Offboard"]
-    shift = recording.log.boot_time_s - sample_flight.log.boot_time_s
-    # heartbeats are sent at 1 Hz
-    for logged, received in zip(sample_flight.modes[1:], recording.modes[2:], strict=True):
-        assert 0.0 <= received.start_s + shift - logged.start_s <= 1.1
-
-
-def test_consecutive_equal_flight_modes_are_merged() -> None:
-    names = pd.Series(["a", "a", "b", "c", "a"], index=[-3.0, 1.0, 2.0, 1.5, 6.0])
-    assert mode_spans(names, 8.0) == (
-        FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
-    )  # fmt: skip
+from px4fuse.flight.model import Reset, Unavailable
 
 
 def test_detected_position_gaps_exceed_1_s_and_five_intervals() -> None:
@@ -60,7 +26,7 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
         duration_s=100.0, uwb=Uwb(gap_s=(60.0, 65.0)), ekf2=Estimator(resets=resets),
         dropouts=(Dropout(9.0, 2.0), Dropout(50.0, 0.5), Dropout(98.0, 1.0)),
     )  # fmt: skip
-    flight = replace(flight, airborne=((20.0, 70.0), (80.0, 99.0)), modes=MODES)
+    flight = replace(flight, airborne=((20.0, 70.0), (80.0, 99.0)))
     comparison = compare(flight, start_s=10.0, end_s=90.0)
     found = collect_events(comparison)
     ((start, end),) = found.gaps
@@ -68,7 +34,6 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     assert found.dropouts == ((10.0, 11.0), (50.0, 50.5))
     assert found.ground == ((10.0, 20.0), (70.0, 80.0))
     assert (found.take_off_s, found.landing_s) == ((20.0, 80.0), (70.0,))
-    assert found.modes == (FlightMode(10.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
     assert found.resets_s == (30.0,)
 
 
@@ -107,7 +72,7 @@ def test_flight_events_without_data_are_empty() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))
-    assert (found.gaps, found.dropouts, found.ground, found.modes) == ((), (), (), ())
+    assert (found.gaps, found.dropouts, found.ground) == ((), (), ())
     assert (found.take_off_s, found.resets_s, dict(found.rejected_s)) == ((), (), {})
     never = compare(replace(flight, airborne=()))
     assert collect_events(never).ground == ((never.segment.start_s, never.segment.end_s),)

@@ -58,7 +58,7 @@ FLIGHTS = {
         (("source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ()),
          ("kf_overconfident", None, {}, ("outliers",)),
          ("ekf2_overconfident", None, {}, ("outliers",))),
-        elsewhere=("gate, missed samples and resets", "4.0 m", "64 s"),
+        elsewhere=("rejections and resets", "4.0 m", "64 s"),
     ),
     "v1.16.1_aisle_clock_late": Flown(
         (("ekf2_ev_delay_wrong", "error", {"ekf2_ev_delay_ms": 0.0, "asked_ms": about(264.0)},

@@ -17,7 +17,7 @@ from scipy.stats import norm
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
-    START_OUTLIER_SHARE,
+    START_OUTLIER_FRACTION,
     START_OUTLIER_WIDTH,
     Likelihood,
     NoiseFit,
@@ -510,16 +510,16 @@ def test_outlier_probability_follows_bayes_rule() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
-        narrow = (1.0 - START_OUTLIER_SHARE) * norm.pdf(error) ** axes
-        wide = START_OUTLIER_SHARE * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
+        narrow = (1.0 - START_OUTLIER_FRACTION) * norm.pdf(error) ** axes
+        wide = START_OUTLIER_FRACTION * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
         got = _outlier_probability(
-            axes * error**2, np.full(25, axes), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+            axes * error**2, np.full(25, axes), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
         )
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
     assert (
         _outlier_probability(
-            np.array([1e200]), np.ones(1), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+            np.array([1e200]), np.ones(1), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
         )
         == 1.0
     )

@@ -222,7 +222,7 @@ def test_read_position_file_time_unit_overrides_column_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
-    assert_stated(file, f"{unit} (given with --position-time-unit)")
+    assert_stated(file, f"{unit} (the unit was given with --position-time-unit)")
 
 
 LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
@@ -294,7 +294,7 @@ def test_read_position_file_unit_option_overrides_column_name(read, unit):
 
 
 @pytest.mark.parametrize(("x", "words"), [
-    ([*X[:7], "4000.0", *X[8:]], "unit m (assumed, because the column names contain no unit)"),
+    ([*X[:7], "4000.0", *X[8:]], "px4fuse assumes this unit, because the column names contain no"),
     (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
 ])  # fmt: skip
 def test_read_position_file_unit_is_not_changed_by_outlier(read, x, words):
@@ -395,7 +395,7 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_file_with_two_tags_requires_body(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
-    assert "contains the bodies A1, B2. Choose one with --body." in error_message(read, text)
+    assert "contains the bodies A1, B2. Choose a body with --body." in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
     assert "contains the bodies A1, B2" in error_message(read, text, body="C3")
     assert "one body, without a name" in error_message(read, table(PLAIN), body="C3")

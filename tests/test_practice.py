@@ -260,24 +260,16 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
             )
         right = number % 3 != 1
         wrong = next(name for name in FAULT_CHOICES if name not in key["right"])
-        page.click("#quiz-size")
-        page.write("1 | 2 m")
         choose(page, *(key["right"] if right else [wrong]))
         points += right
         heading = page.ask("document.querySelector('#quiz-solution h2').textContent")
         assert heading == ("✓ Correct" if right else "✕ Wrong")
-        rows = page.ask(
-            "[...document.querySelectorAll('#quiz-solution tbody tr')].map((row) =>"
-            "[...row.cells].map((cell) => cell.textContent))"
-        )
-        faults = "; ".join(one["fault"] for one in key["mistakes"])
-        yours = FAULT_CHOICES[key["right"][0] if right else wrong]
-        assert rows[0] == ["fault", yours, faults or "no mistake"]
-        assert rows[1][:2] == ["size", "1   2 m"]
-        assert rows[1][2] == ("; ".join(one["size"] for one in key["mistakes"]) or "–")
+        if not key["mistakes"]:
+            assert "no fault" in element_text(page, "quiz-solution")
         for mistake in key["mistakes"]:
             assert (mistake["span"] is not None) == (key["right"] == ["source"])
-            assert mistake["symptom"] in element_text(page, "quiz-solution")
+            for name in ("fault", "size", "time", "symptom"):
+                assert mistake[name] in element_text(page, "quiz-solution")
         assert f"Score: {points} of {number + 1} answered flights" in element_text(
             page, "quiz-score"
         )

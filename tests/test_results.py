@@ -190,7 +190,7 @@ def test_results_json_numbers_have_ten_significant_digits():
 def test_results_omit_number_outside_bounds_and_state_reason():
     """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
-    assert within_bounds(results) is results
+    assert within_bounds(results) == results
     axis = results.axes["aisle"]
     kf = replace(axis.filters["kf"], nis_mean=-3.0)
     ekf2 = replace(axis.filters["ekf2"], sigma_p_median_m=1e10)

@@ -115,7 +115,7 @@ BAD_ROSTERS = {
     "same file": ("id\na/b\na:b\n", "the id of 'a:b' cannot be used as a file name"),
     "no usable characters": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not a text file"),
-    "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
+    "spreadsheet": (b"PK\x03\x04....", "Save the table as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
     "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
     "quotes never closed": ('id,name\n1,"Ada\n2,Bob\n', "not a CSV file"),

@@ -386,7 +386,7 @@ def test_verify_finds_changed_plot_despite_other_libraries(
     assert verdict.outcome == "cannot verify", verdict
     assert "page 1: drawing operation" in verdict.reasons[0]
     assert any("made with matplotlib 3.99.0; this" in reason for reason in verdict.reasons)
-    assert verdict.remedy.startswith("Verify it with matplotlib 3.99.0.")
+    assert verdict.remedy.startswith("Verify the report with matplotlib 3.99.0.")
     assert verdict.redrawn == foreign.again[1]()
 
 

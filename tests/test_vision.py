@@ -186,7 +186,7 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         body_to_ned=whole.body_to_ned[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
         heights=None, state=whole.state[:15], variance=whole.variance[:15],
-        clipped_share=None, is_acceleration_bad=None,
+        clipped_fraction=None, is_acceleration_bad=None,
         correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip

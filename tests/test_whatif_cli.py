@@ -73,7 +73,7 @@ def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path)
     parts = [said["whatif"][axis]["position_rmse_to_truth_m"] for axis in ("north", "east")]
     assert np.hypot(*parts) > 1.0
     (note,) = [one for one in said["notes"] if one.startswith("Without ev_pos from 100 s on")]
-    assert "EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s)" in note
+    assert "EKF2 stops publishing a position after EKF2_NOAID_TOUT (5 s)" in note
 
 
 def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
@@ -157,7 +157,7 @@ class TestFlownFlights:
         (cured,) = found.whatif.whatif
         assert error(cured) < 0.7 * error(found.whatif.logged)
         with pytest.raises(
-            SettingsError, match="the fusion horizon follows from the largest delay parameter"
+            SettingsError, match="the largest delay parameter is the delay of the fusion horizon"
         ):
             what_if(open_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 

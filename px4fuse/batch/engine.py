@@ -75,9 +75,10 @@ def _check_workers(client: Client) -> None:
     own_version = metadata.version("px4fuse")
     for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
         if worker_version != own_version:
-            found = worker_version if isinstance(worker_version, str) else "missing"
+            version_text = worker_version if isinstance(worker_version, str) else "missing"
             raise SettingsError(
-                f"px4fuse version: {found} on Dask worker {name}, {own_version} on this computer.",
+                f"px4fuse version: {version_text} on Dask worker {name}, "
+                f"{own_version} on this computer.",
                 "Install the same version of px4fuse on the worker and on this computer.",
             )
 

@@ -73,7 +73,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             info_by_path = {
                 path: info for path, info in all_files.items() if info["type"] == "file"
             }
-    # OSError, or for URLs an exception of another package (unknown account or bucket)
+    # fsspec raises other exceptions than OSError for URLs, such as an unknown account
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."

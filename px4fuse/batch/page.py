@@ -215,7 +215,7 @@ def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
-    filters = []
+    page_filters = []
     for kind, label in PAGE_FILTERS.items():
         options = [
             (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
@@ -223,8 +223,8 @@ def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            filters.append((label, [("", "All"), *options]))
-    return filters
+            page_filters.append((label, [("", "All"), *options]))
+    return page_filters
 
 
 # -------------------- combination of the table rows of each log

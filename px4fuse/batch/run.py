@@ -179,7 +179,7 @@ def run(
     """
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
         raise SettingsError(
-            "batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
+            "px4fuse batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
         )
     logs = find_logs(paths)
     check_output_folder(output)
@@ -230,17 +230,19 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
         first_row = cached_rows.rows[0]
-        files = [state.output / first_row.get(kind, "") for kind in FILE_COLUMNS[: 1 + reports]]
-        if "axis" not in first_row or all(file.is_file() for file in files):
+        output_files = [
+            state.output / first_row.get(column, "") for column in FILE_COLUMNS[: 1 + reports]
+        ]
+        if "axis" not in first_row or all(output_file.is_file() for output_file in output_files):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
 
 def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
     """Yield the cached table rows in a folder for this px4fuse version and these settings."""
-    for file in sorted((folder / "rows").glob("*.json")):
+    for cache_file in sorted((folder / "rows").glob("*.json")):
         try:
-            cached_rows = msgspec.json.decode(file.read_bytes(), type=CachedRows)
+            cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
         if (cached_rows.px4fuse, cached_rows.settings) == (px4fuse, settings):

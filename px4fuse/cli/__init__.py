@@ -37,6 +37,7 @@ COMMANDS = {
     "verify": "Verify that the numbers of a report follow from its log.",
     "grade": "Verify and grade the reports of a class.",
     "sample": "Write the sample logs (aisle with UWB, loop with VIO).",
+    "mcp": "Serve px4fuse to assistants (Model Context Protocol).",
     "lesson": "Print the worked examples of the lesson UAT 366, module 2.",
 }
 
@@ -66,7 +67,6 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import one command; None if the name is unknown."""
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"px4fuse.cli.{cmd_name}")

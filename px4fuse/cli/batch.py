@@ -10,13 +10,12 @@ from typing import Any, Literal
 
 import click
 
-from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
 
 FAILED_STATUS = "failed"
-# Types of clusters for which px4fuse prints instructions (NAME.txt in this folder)
+# Values of --scheduler for which px4fuse prints the instructions in NAME.txt
 CLUSTERS = ("slurm", "kubernetes")
 
 
@@ -24,28 +23,14 @@ CLUSTERS = ("slurm", "kubernetes")
 @click.argument("logs", nargs=-1, metavar="LOGS...")
 @options.output_option("DIR", "Output folder for the table and the results of each log.")
 @click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
-@click.option(
-    "--timeout",
-    "timeout_s",
-    type=click.FloatRange(1.0),
-    metavar="SECONDS",
-    default=TIMEOUT_S,
-    help="Maximum time for one log (s); a log that takes longer fails.",
-)
+@options.timeout_option
 @click.option(
     "--workers",
     type=click.IntRange(1, 1024),
     metavar="N",
     help="Number of logs that this computer processes in parallel.  [default: number of cores]",
 )
-@click.option(
-    "--memory",
-    "memory_gb",
-    type=click.FloatRange(1.0),
-    metavar="GB",
-    default=4.0,
-    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
-)
+@options.memory_option
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
@@ -76,7 +61,7 @@ def batch(
         click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
         return
     if output is None:
-        raise SettingsError("batch requires an output folder: -o DIR.")
+        raise SettingsError("px4fuse batch requires an output folder: -o DIR.")
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.batch.run import run

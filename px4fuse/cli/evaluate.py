@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # Maximum RPE delta (m, s or frames)
 MAX_DELTA = 1e6
-# Options with the name of an argument of px4fuse.trajectory.evaluation.evaluate
+# Options that are passed to px4fuse.trajectory.evaluation.evaluate as arguments
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 

@@ -93,7 +93,7 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
 
 
 def _csv_bytes(table: pd.DataFrame) -> bytes:
-    # pandas writes the shortest text of a number from which the same float64 is read
+    # pandas writes enough digits to read the same float64 again
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 

@@ -173,7 +173,7 @@ def grade(
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
-        raise SettingsError("grade requires an output folder: -o DIR.")
+        raise SettingsError("px4fuse grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
     answer_key = None if key is None else read_key(key)
     course = Course(

@@ -124,7 +124,7 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
         count = len(log.dropouts)
-        text = f"{count} logger dropouts: total {lost_s:.2f} s, longest {longest_s:.2f} s"
+        text = f"{count} logger dropouts of {lost_s:.2f} s in total, at most {longest_s:.2f} s"
         labelled_texts.append(("Dropouts", text))
     labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
@@ -134,17 +134,16 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
 
 
 def _duration_text(seconds: float) -> str:
-    return (
-        f"{seconds:.{1 if seconds >= 1 else 3}f} s"
-        if seconds
-        else "all samples have the same timestamp"
-    )
+    if not seconds:
+        return "all samples have the same timestamp"
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s"
 
 
 def _start_text(inventory: Inventory) -> str:
     if inventory.start_utc is None:
-        return f"starting {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
-    return f"starting at {inventory.start_utc[:19].replace('T', ' ')} UTC"
+        boot_time_s = inventory.flight.log.boot_time_s
+        return f"the data start {boot_time_s:.1f} s after boot (the log contains no UTC)"
+    return f"the data start at {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
 def _airborne_text(inventory: Inventory) -> str:
@@ -172,10 +171,10 @@ def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
 def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
     from px4fuse.report.style import MUTED_COLOUR
 
-    previous = ""
+    previous_part = ""
     for source in inventory.sources:
-        data_type = source.part if source.part != previous else ""
-        previous = source.part
+        data_type = source.part if source.part != previous_part else ""
+        previous_part = source.part
         if source.unavailable:
             # another table contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 from click.core import ParameterSource
 
+from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
@@ -35,11 +36,6 @@ from px4fuse.request import (
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
-
-
-def parse_columns(text: str) -> tuple[str, ...]:
-    """Parse comma-separated column names, or column numbers, of a position file."""
-    return tuple(text.split(","))
 
 
 Option = Callable[[Callable[..., None]], Callable[..., None]]
@@ -127,6 +123,24 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
+#: Option --timeout of commands that analyse logs in worker processes
+timeout_option = click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(1.0),
+    metavar="SECONDS",
+    default=TIMEOUT_S,
+    help="Maximum time for one log (s); a log that takes longer fails.",
+)
+#: Option --memory of commands that analyse logs in worker processes
+memory_option = click.option(
+    "--memory",
+    "memory_gb",
+    type=click.FloatRange(1.0),
+    metavar="GB",
+    default=4.0,
+    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
+)
 # The size limit of logs is not part of a request, because it does not affect results
 max_size_option = click.option(
     "--max-size",
@@ -171,7 +185,6 @@ def report_options(text: str) -> Option:
 
 
 def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    """Declare --fail-on: exit code 1 on a finding of a severity."""
     return click.option("--fail-on", type=Choice(severities), help=text)
 
 
@@ -247,7 +260,7 @@ position_options = _combine_options(
     ),
     click.option(
         "--position-columns",
-        type=parse_columns,
+        type=lambda names: tuple(names.split(",")),
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of the columns of the position file; SIGMA is the standard "
         "deviation of the position.  [default: detected from the names]",

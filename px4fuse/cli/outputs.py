@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name, because file systems allow 255; of a longer name
-# the first KEPT_STEM_BYTES bytes are used
+# Maximum length (bytes) of a default report name: file systems allow 255. A longer name is cut to
+# KEPT_STEM_BYTES
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id of the student in a report without a student
 NO_STUDENT_NAME = ("", "")
@@ -39,9 +39,12 @@ UNWRAPPED_WIDTH = 10_000
 WRITTEN_KEY = "px4fuse.written"
 # Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
+# Keys in the context of click that px4fuse mcp sets: function that sends the activity of a run, and
+# list to which the results (JSON text) are added instead of being printed
+SEND_KEY, RESULTS_KEY = "px4fuse.send", "px4fuse.results"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
-# Element in the head of a web page with the command and the SHA-256 of its log
+# HTML element that contains the command and the SHA-256 of the log of a web page
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
@@ -72,6 +75,9 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
     In a pipe, or if ``output`` is standard output, the function shows nothing.
     """
+    if (send := click.get_current_context().meta.get(SEND_KEY)) is not None:
+        yield lambda activity, *_: send(activity)
+        return
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -217,6 +223,9 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
+    if (recorded := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
+        recorded.append(text)
+        json_path = None if json_path == STANDARD_OUTPUT else json_path
     if output is not None and analysis is not None:
         from px4fuse.report.pdf import render
 
@@ -242,7 +251,6 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """Format a sentence with the files that this run has written, for a run that ends early."""
     written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{written_before(written_files)}." if written_files else "nothing was written."
 
@@ -322,7 +330,6 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    """Print a page on standard output or, if it reports an error, on standard error."""
     from px4fuse.report.screen import show
 
     show(terminal(is_error=is_error), page.blocks)

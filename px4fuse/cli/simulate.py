@@ -41,8 +41,9 @@ _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: Kind = "outdoor"
 SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
-# Options that require --assignment, and all options that are allowed together with it
+# Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
+# All options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
     "output",
     "assignment",
@@ -299,7 +300,7 @@ def _write_assignment(
             right_aligned_columns=(4,),
         )
         closing_texts["Preview"] = (
-            "no file was written. Not for students: the table lists the injected faults."
+            "no file was written. Do not show the table to students: it lists the injected faults."
         )
     else:
         with progress() as show_progress:
@@ -318,7 +319,7 @@ def _write_assignment(
         )
         if key.secret:
             closing_texts["Secret"] = (
-                "generated, and stored in the answer key. Use --secret-file to write the same "
+                "a new secret is stored in the answer key. Use --secret-file to write the same "
                 "flights again, or to add students."
             )
     counts = Counter(
@@ -364,7 +365,9 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     ]
     page.write_labelled("Faults", *(mistake_texts or ["none"]))
     page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    ekf2_text = "px4fuse's model of EKF2" if scenario.ekf2 else "not simulated (--no-ekf2)"
+    ekf2_text = "EKF2 is not simulated (--no-ekf2)"
+    if scenario.ekf2:
+        ekf2_text = "EKF2 data are from px4fuse's model of EKF2"
     page.write_labelled("EKF2", ekf2_text)
     if answer is not None:
         page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")

@@ -162,9 +162,9 @@ def run_interventions(
         filters.append(_Filter("ekf2", rerun_ekf2, model))
     return tuple(
         trial
-        for each in filters
+        for tested_filter in filters
         for result in comparison.axes.values()
-        for trial in _try_changes(comparison, estimates, each, result)
+        for trial in _try_changes(comparison, estimates, tested_filter, result)
     )
 
 
@@ -183,9 +183,9 @@ def planned_configurations(
     ]
 
 
-def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
+def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
     """Return True if the filter was tested and is over- or underconfident."""
-    return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
+    return not isinstance(summary, Unavailable) and summary.verdict != "consistent"
 
 
 def _changes_along(
@@ -216,19 +216,19 @@ def _changes_along(
 
 
 def _try_changes(
-    comparison: Comparison, estimates: Estimates, each: _Filter, result: AxisComparison
+    comparison: Comparison, estimates: Estimates, tested_filter: _Filter, result: AxisComparison
 ) -> list[Trial]:
-    changes = _changes_along(comparison, estimates, each.inputs, result)
+    changes = _changes_along(comparison, estimates, tested_filter.inputs, result)
     if not changes:
         return []
-    before, is_logged = _flown_statistics(each, result)
+    before, is_logged = _flown_statistics(tested_filter, result)
 
-    def run(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
-        after = each.rerun(result, change)
+    def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
+        after = tested_filter.rerun(result, change)
         return Trial(
-            filter=each.name,
+            filter=tested_filter.name,
             axis=result.axis.name,
-            kinds=change_kinds(comparison, each.inputs, change),
+            kinds=change_kinds(comparison, tested_filter.inputs, change),
             change=change,
             discrepancies=tuple(
                 statistic
@@ -238,48 +238,50 @@ def _try_changes(
             before=before,
             is_logged=is_logged,
             after=after,
-            from_s=None if each.model is None else each.model.flown.evaluated_s[0][0],
+            from_s=None
+            if tested_filter.model is None
+            else tested_filter.model.flown.evaluated_s[0][0],
         )
 
-    trials = [run(change, discrepancies) for change, discrepancies in changes]
+    trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
     for statistic in DISCREPANCIES:
         helpful = helpful_trials(trials, statistic)
         trials += [
-            run({**helpful[0].change, **other.change}, (statistic,)) for other in helpful[1:]
+            make_trial({**helpful[0].change, **other.change}, (statistic,)) for other in helpful[1:]
         ]
     return trials
 
 
-def _flown_statistics(each: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
+def _flown_statistics(tested_filter: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
     """Return the statistics of a filter as flown, and True if they are from the log or from KF."""
-    replayed, logged = each.rerun(result, {}), result.ekf2_state
-    if each.model is None:
-        return replayed, True
+    replayed_statistics, logged_state = tested_filter.rerun(result, {}), result.ekf2_state
+    if tested_filter.model is None:
+        return replayed_statistics, True
     innovations = result.ekf2_innovations
-    if isinstance(logged, Unavailable) or isinstance(innovations, Unavailable):
-        return replayed, False
-    compared_s = each.model.flown.evaluated_s
-    state = logged[inside_spans(logged.index, compared_s)]
+    if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
+        return replayed_statistics, False
+    compared_s = tested_filter.model.flown.evaluated_s
+    compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
     innovations = innovations[inside_spans(innovations.index, compared_s)]
     rejected = innovations["rejected"].dropna()
-    in_log = _statistics(
+    logged_statistics = _statistics(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
-        error_statistics(state, result.ekf2_variance, result.truth),
-        difference(result.replay, state),
+        error_statistics(compared_state, result.ekf2_variance, result.truth),
+        difference(result.replay, compared_state),
         float((rejected > 0.0).mean()) if len(rejected) else None,
     )
-    pairs = (
-        (in_log.position_rmse_m, replayed.position_rmse_m, MAX_REPLAY_FACTOR),
-        (in_log.nis_mean, replayed.nis_mean, MAX_REPLAY_FACTOR**2),
-        (in_log.nees_mean, replayed.nees_mean, MAX_REPLAY_FACTOR**2),
+    logged_and_replayed = (
+        (logged_statistics.position_rmse_m, replayed_statistics.position_rmse_m, MAX_REPLAY_FACTOR),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_FACTOR**2),
+        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_FACTOR**2),
     )
     agrees = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
-        for logged_value, replayed_value, factor in pairs
+        for logged_value, replayed_value, factor in logged_and_replayed
         if logged_value is not None
     )
-    return (in_log, True) if agrees else (replayed, False)
+    return (logged_statistics, True) if agrees else (replayed_statistics, False)
 
 
 def _statistics(
@@ -367,7 +369,7 @@ def _replay_ekf2(
     if not change:
         return model.flown
     settings = {name: value for name, value in change.items() if name in PARAMETERS}
-    changed = with_misaligned_positions(
+    changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
     excluded_s, tuned = None, tuning_of_axis(tuning, HORIZONTAL)
@@ -376,7 +378,7 @@ def _replay_ekf2(
         if comparison.source.origin.fused_as_gnss:
             excluded_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed, [settings], excluded_s)
+    (replay,) = replay_settings(changed_model, [settings], excluded_s)
     return replay
 
 
@@ -391,11 +393,13 @@ def _replay_statistics(
     if ROTATION in change and comparison.source.origin.is_gnss:
         # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
-    weights, updates = axis.direction[:2], ekf2_replay.updates
+    direction_cosines, updates = axis.direction[:2], ekf2_replay.updates
     updates = updates[inside_spans(updates.index, compared_s)]
-    innovation_variance_m2 = weighted_sum(updates, UPDATE_COLUMNS[2:4], weights**2)
-    prior_m2 = innovation_variance_m2 - weighted_sum(updates, OBSERVATION_VARIANCES, weights**2)
-    posterior_m2 = weighted_sum(updates, POSITION_VARIANCES, weights**2)
+    innovation_variance_m2 = weighted_sum(updates, UPDATE_COLUMNS[2:4], direction_cosines**2)
+    prior_m2 = innovation_variance_m2 - weighted_sum(
+        updates, OBSERVATION_VARIANCES, direction_cosines**2
+    )
+    posterior_m2 = weighted_sum(updates, POSITION_VARIANCES, direction_cosines**2)
     variance = pd.DataFrame(
         {
             "position_variance_m2": 0.5 * (prior_m2 + posterior_m2),
@@ -405,13 +409,13 @@ def _replay_statistics(
     )
     published = project(ekf2_replay.published, axis, comparison.segment)
     published = published[inside_spans(published.index, compared_s)]
-    logged, compared = result.ekf2_state, published
-    if not change and not isinstance(logged, Unavailable):
-        compared = logged[inside_spans(logged.index, compared_s)]
+    logged_state, compared_track = result.ekf2_state, published
+    if not change and not isinstance(logged_state, Unavailable):
+        compared_track = logged_state[inside_spans(logged_state.index, compared_s)]
     return _statistics(
-        weighted_sum(updates, UPDATE_COLUMNS[:2], weights),
+        weighted_sum(updates, UPDATE_COLUMNS[:2], direction_cosines),
         innovation_variance_m2,
         error_statistics(published, variance, result.truth),
-        difference(result.replay, compared),
+        difference(result.replay, compared_track),
         float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
     )

@@ -229,32 +229,32 @@ def error_statistics(
     )
 
 
-def _horizon_nees(horizon: pd.DataFrame | None, truth: Frame) -> float | None:
-    if horizon is None or isinstance(truth, Unavailable):
+def _horizon_nees(horizon_state: pd.DataFrame | None, truth: Frame) -> float | None:
+    if horizon_state is None or isinstance(truth, Unavailable):
         return None
-    errors = _errors(horizon, truth, "position_m")
-    return _mean_nees(errors / np.sqrt(horizon["position_variance_m2"].to_numpy()))
+    errors = _errors(horizon_state, truth, "position_m")
+    return _mean_nees(errors / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
-    true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
-    return np.asarray(state[column].to_numpy() - true)
+    true_values = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
+    return np.asarray(state[column].to_numpy() - true_values)
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
     """Interpolate a reported variance to ``time_s``, and return σ; NaN where unknown."""
-    known = _known_values(variance, column)
-    if known.empty:
+    known_variance = _known_values(variance, column)
+    if known_variance.empty:
         return np.full(len(time_s), np.nan)
-    reported = np.interp(time_s, known.index, known, np.nan, np.nan)
-    return np.asarray(np.sqrt(np.where(reported > 0.0, reported, np.nan)))
+    variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
+    return np.asarray(np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan)))
 
 
 def _mean_nees(normalised: Array) -> float | None:
     return float(np.nanmean(np.square(normalised))) if np.isfinite(normalised).any() else None
 
 
-def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
+def position_errors(result: AxisComparison, filter_name: FilterName) -> Frame:
     """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
     The index is the time (s) of EKF2's published state or, without EKF2, of KF's predictions. The
@@ -264,7 +264,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
         return result.truth
     state: pd.DataFrame
     variance: Frame
-    if owner == "kf":
+    if filter_name == "kf":
         state, variance = _kf_track(result.replay, result.ekf2_state)
     elif isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state
@@ -277,13 +277,13 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
 
 
 def normalised_position_errors(
-    result: AxisComparison, owner: FilterName
+    result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
     """Return the times (s), and the position errors against ground truth ÷ reported σ."""
-    errors = position_errors(result, owner)
+    errors = position_errors(result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
-    if owner == "ekf2" and isinstance(result.ekf2_variance, Unavailable):
+    if filter_name == "ekf2" and isinstance(result.ekf2_variance, Unavailable):
         return result.ekf2_variance
     normalised = (errors["error_m"] / errors["sigma_m"]).dropna()
     if normalised.empty:
@@ -305,5 +305,7 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     if len(frames_of_axes) < 2:
         return None
     # the horizontal NIS needs the innovations north and east of an update (same timestamp)
-    joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
-    return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))
+    north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
+    return assess_horizontal(
+        (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])
+    )

@@ -153,10 +153,12 @@ def add_sentences(
         Different behaviour of KF and EKF2, by the name of the replaced property.
     """
     reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
-    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
+    largest_step, second_step, *_ = sorted(
+        explanation.steps, key=lambda step: -step.position_mean_square_m2
+    )
     cause = (
-        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name}. "
-        f"{reasons[first.name]}."
+        f"Largest contribution to the difference KF - EKF2 along {axis_label}: "
+        f"{largest_step.name}. {reasons[largest_step.name]}."
     )
     sentences = []
     if explanation.corrected:
@@ -167,11 +169,14 @@ def add_sentences(
             f"KF is first run again with the estimated noise ({settings}). The following "
             "sentences explain the remaining difference KF - EKF2."
         )
-    sentences.append(f"{cause} {_effect_text(first, explanation)}")
-    if second.position_mean_square_m2 >= MIN_NOTABLE_FRACTION * explanation.position_mean_square_m2:
+    sentences.append(f"{cause} {_effect_text(largest_step, explanation)}")
+    if (
+        second_step.position_mean_square_m2
+        >= MIN_NOTABLE_FRACTION * explanation.position_mean_square_m2
+    ):
         sentences.append(
-            f"Second largest contribution: {second.name}. {reasons[second.name]}. "
-            f"{_effect_text(second, explanation)}"
+            f"Second largest contribution: {second_step.name}. {reasons[second_step.name]}. "
+            f"{_effect_text(second_step, explanation)}"
         )
     sentences += [_unexplained_sentence(explanation), *_truth_sentences(explanation)]
     min_reported_m = max(
@@ -187,13 +192,13 @@ def add_sentences(
 
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
-    share = step.position_mean_square_m2 / explanation.position_mean_square_m2
+    fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
     # all fractions add up to 100 %
-    opposite = "; other properties of EKF2 increase it" if share > 1.0 else ""
+    opposite = "; other properties of EKF2 increase it" if fraction > 1.0 else ""
     return (
         f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
         f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
-        f"{100 * share:.0f} %{opposite}."
+        f"{100 * fraction:.0f} %{opposite}."
     )
 
 
@@ -271,17 +276,17 @@ def _step_reasons(
 
 def _unexplained_sentence(explanation: DifferenceExplanation) -> str:
     position, velocity = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
-    position_share, velocity_share = (
-        f"{100 * min(share, 1.0):.1f} %"
-        for share in (
+    position_percent, velocity_percent = (
+        f"{100 * min(fraction, 1.0):.1f} %"
+        for fraction in (
             explanation.unexplained_fraction,
             explanation.unexplained_velocity_mean_square_m2_s2 / velocity,
         )
     )
     return (
         f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(velocity):.3f} m/s. The replay does not explain {position_share} of the mean "
-        f"square position difference and {velocity_share} of the mean square velocity difference."
+        f"{np.sqrt(velocity):.3f} m/s. The replay does not explain {position_percent} of the mean "
+        f"square position difference and {velocity_percent} of the mean square velocity difference."
     )
 
 

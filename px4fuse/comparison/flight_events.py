@@ -1,4 +1,4 @@
-"""Events of a flight (gaps, rejections, resets, flight modes) for the time axes of all charts."""
+"""Events of a flight (gaps, rejections, resets) for the time axes of all charts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import pandas as pd
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
-from px4fuse.flight.model import Ekf2, Flight, FlightMode, Unavailable
+from px4fuse.flight.model import Ekf2, Flight, Unavailable
 
 # Minimum length of a gap in the position source, in seconds and in sample intervals: jitter and
 # single lost positions cause shorter gaps
@@ -29,8 +29,6 @@ class Events:
         Spans in which the logger wrote no data.
     ground : tuple of (float, float)
         Spans on the ground, from the land detector.
-    modes : tuple of FlightMode
-        Flight modes of PX4; empty if not logged.
     resets_s : tuple of float
         Resets of EKF2's position or velocity.
     rejected_s : mapping from axis name to ndarray
@@ -42,7 +40,6 @@ class Events:
     ground: tuple[Span, ...]
     take_off_s: tuple[float, ...]
     landing_s: tuple[float, ...]
-    modes: tuple[FlightMode, ...]
     resets_s: tuple[float, ...]
     rejected_s: Mapping[str, Array]
 
@@ -64,14 +61,13 @@ def airborne_spans(flight: Flight) -> tuple[Span, ...]:
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect gaps, rejections, resets and flight modes of a flight."""
+    """Collect gaps, rejections and resets of a flight."""
     flight, segment = comparison.flight, comparison.segment.flight
     low, high = segment.start_s, segment.end_s
     time_s = np.concatenate([[low], comparison.lines[0].measurement_time_s, [high]])
 
     airborne = airborne_spans(flight)
     edges = [low, *(time for span in airborne for time in span), high]
-    modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=source_gaps(time_s, comparison.source.rate_hz),
@@ -84,11 +80,6 @@ def collect_events(comparison: Comparison) -> Events:
         else segment.cut(zip(edges[::2], edges[1::2], strict=True)),
         take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
         landing_s=tuple(end for _, end in airborne if low <= end <= high),
-        modes=tuple(
-            FlightMode(max(mode.start_s, low), min(mode.end_s, high), mode.name)
-            for mode in modes
-            if mode.start_s < high and mode.end_s > low
-        ),
         resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
         rejected_s={
             result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()

@@ -119,8 +119,6 @@ class AxisComparison(Record, frozen=True, kw_only=True):
         Origin of the axis direction, for the user.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
-    axis : Axis
-    replay : Replay
     ekf2_state : DataFrame or Unavailable
         Position and velocity, without resets that move the origin of EKF2's frame.
     ekf2_innovations : DataFrame or Unavailable

@@ -60,15 +60,15 @@ def find_noisy_part(
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    lines = [result.axis for result in north_and_east(comparison)]
-    if sigma_a is None or sigma_z is None or len(lines) < 2:
+    axes = [result.axis for result in north_and_east(comparison)]
+    if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
-    increments_by_axis = [preintegrate(line, settings) for line in lines]
-    time = lines[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
-    if len(time) < MAX_PARTS * MIN_PART_COUNT // 2:
+    increments_by_axis = [preintegrate(line, settings) for line in axes]
+    time_s = axes[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
+    if len(time_s) < MAX_PARTS * MIN_PART_COUNT // 2:
         return None
-    count = min(MAX_PARTS, len(time) // MIN_PART_COUNT)
-    edges = np.linspace(0, len(time), count + 1).astype(int)
+    count = min(MAX_PARTS, len(time_s) // MIN_PART_COUNT)
+    edges = np.linspace(0, len(time_s), count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
         # wrong noise settings would change the size of innovations along the flight
@@ -80,18 +80,18 @@ def find_noisy_part(
         # the median of each axis removes the difference between the axes
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
-    sizes = relative_innovations(None)
-    part_sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
+    relative_sizes = relative_innovations(None)
+    part_sigma = np.array([np.median(relative_sizes[:, low:high]) for low, high in pairwise(edges)])
     is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
     first_part = int(np.argmax(is_noisy))
     end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
     if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
         return None  # the noisy time spans are not contiguous
-    is_quiet = np.ones(len(time), bool)
+    is_quiet = np.ones(len(time_s), bool)
     is_quiet[edges[first_part] : edges[end_part]] = False
     ratios = (
         float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
-        for relative in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
+        for relative in (relative_sizes, relative_innovations(np.isin(time_s, outlier_time_s)))
     )
-    start_s, end_s = time[[edges[first_part], edges[end_part] - 1]].tolist()
+    start_s, end_s = time_s[[edges[first_part], edges[end_part] - 1]].tolist()
     return NoisyPart(start_s, end_s, *ratios)

@@ -250,7 +250,7 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action."""
-    damaged = "the file is damaged, and " if flight.log.damage else ""
+    damage_text = "the file is damaged, and " if flight.log.damage else ""
     topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
@@ -258,12 +258,12 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     )
     if flight.log.format.startswith("MAVLink"):
         topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
-        ulog = ", or the ULog" if flight.log.has_ulog else ""
-        remedy = f"give the position file of the positioning system with `position`{ulog}."
+        ulog_text = ", or the ULog" if flight.log.has_ulog else ""
+        remedy = f"give the position file of the positioning system with `position`{ulog_text}."
     if flight.positions:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
-    reason = f"{damaged}no external position in this log (no {topics})"
+    reason = f"{damage_text}no external position in this log (no {topics})"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"
@@ -324,12 +324,12 @@ def choose_segment(
         low, high = max(flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s))
         reason = "positions available and vehicle airborne"
         if len(flights) > 1:
-            others = ", ".join(
+            others_text = ", ".join(
                 f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
                 for start, end in flights
                 if start != low
             )
-            reason += f"; this is the longest of {len(flights)} flights; the others: {others}"
+            reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
         if not max(low, first_s) < min(high, last_s):
             low, high = min(low, first_s), max(high, last_s)
             reason = "whole duration of the position source (no positions in flight)"

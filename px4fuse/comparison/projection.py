@@ -99,21 +99,21 @@ def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
     """Yield EKF2's position without resets, with the origin of each time span between resets."""
-    deltas = np.array([reset.delta for reset in resets])[:, axes]
+    reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
         # keep the origin after this number of resets: add earlier resets, subtract later ones
-        shift_m = (~is_after[:, :earlier_count]) @ deltas[:earlier_count] - is_after[
+        shift_m = (~is_after[:, :earlier_count]) @ reset_m[:earlier_count] - is_after[
             :, earlier_count:
-        ] @ deltas[earlier_count:]
+        ] @ reset_m[earlier_count:]
         yield published + shift_m
 
 
 def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
-    squared = np.zeros(len(samples))
+    distance_m2 = np.zeros(len(samples))
     for column in samples:
-        squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
-    return float(np.median(squared)) if len(squared) else float("inf")
+        distance_m2 += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
+    return float(np.median(distance_m2)) if len(distance_m2) else float("inf")
 
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
@@ -127,9 +127,9 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     return pd.DataFrame(projected, index=rows.index)
 
 
-def _no_samples(what: str) -> Unavailable:
-    reason = f"the log contains no {what} in the analysed time span"
-    return Unavailable(what, reason, "Analyse a longer time span.")
+def _no_samples(quantity_name: str) -> Unavailable:
+    reason = f"the log contains no {quantity_name} in the analysed time span"
+    return Unavailable(quantity_name, reason, "Analyse a longer time span.")
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
@@ -224,8 +224,8 @@ def project_innovations(
 
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
-    common = north.index.intersection(east.index)
-    north, east = north.loc[common], east.loc[common]
+    common_times = north.index.intersection(east.index)
+    north, east = north.loc[common_times], east.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
     projected = cosine * cosine * north + sine * sine * east  # correct for variances only
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]

@@ -178,23 +178,27 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
-def distance_from_one(outcome: RunStatistics) -> float:
+def distance_from_one(statistics: RunStatistics) -> float:
     """Return the sum of |ln σ ratio| against source and ground truth."""
-    means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
+    means = [mean for mean in (statistics.nis_mean, statistics.nees_mean) if mean]
     return sum(0.5 * abs(math.log(mean)) for mean in means)
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
     """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
-    enters = enters_band(trial)
-    return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
+    becomes_consistent = enters_band(trial)
+    return (
+        not becomes_consistent,
+        len(trial.change) if becomes_consistent else 0,
+        distance_from_one(trial.after),
+    )
 
 
-def ratios(outcome: RunStatistics) -> dict[Reference, float]:
+def ratios(statistics: RunStatistics) -> dict[Reference, float]:
     """Return the σ ratios (actual over reported) against source and ground truth."""
     means: dict[Reference, float | None] = {
-        "source": outcome.nis_mean,
-        "truth": outcome.nees_mean,
+        "source": statistics.nis_mean,
+        "truth": statistics.nees_mean,
     }
     return {against: math.sqrt(mean) for against, mean in means.items() if mean}
 
@@ -238,7 +242,7 @@ def leaves_error(trial: Trial) -> bool:
 
 
 def find_trial(
-    trials: Iterable[Trial], owner: FilterName, kind: str, name: str = ""
+    trials: Iterable[Trial], filter_name: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
     """Return the best re-run of one filter with one kind of change that improves something.
 
@@ -248,7 +252,7 @@ def find_trial(
         (
             trial
             for trial in trials
-            if trial.filter == owner
+            if trial.filter == filter_name
             and trial.kinds == (kind,)
             and (not name or name in trial.change)
             and improvement(trial) != "nothing"

@@ -191,8 +191,10 @@ def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
     The noise of the source is from third differences of the positions, which contain hardly any
     motion.
     """
-    third = np.diff(positions.position_m, 3, axis=0)
-    deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
+    third_differences = np.diff(positions.position_m, 3, axis=0)
+    deviation = 1.4826 * float(
+        np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
+    )
     noise_m = UNITS[hypothesis.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
     return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 

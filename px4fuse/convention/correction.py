@@ -169,8 +169,8 @@ def correct(
     if not faults.axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
-    return replace(flight, attitude=table), track
+    attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
+    return replace(flight, attitude=attitude_table), track
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:

@@ -11,7 +11,7 @@ import os
 import stat
 import sys
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -27,6 +27,8 @@ else:
 
 #: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
+#: Folders from which files may be read, which ``px4fuse mcp`` sets; empty: all folders
+readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
 LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
 
 
@@ -47,6 +49,19 @@ def split_part(argument: str) -> tuple[Path, str | None]:
     return Path(argument), None
 
 
+def check_readable(path: Path, folders: Sequence[Path]) -> None:
+    """Raise a LogError if a path, with symbolic links resolved, is outside of all folders.
+
+    ``folders`` are resolved paths; without folders, each path is accepted.
+    """
+    target = Path(os.path.realpath(path))
+    if folders and not any(map(target.is_relative_to, folders)):
+        folder_names = " or ".join(map(str, folders))
+        raise LogError(
+            f"{display_name(path)} is outside the folders of --root", f"Copy it to {folder_names}."
+        )
+
+
 def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
     """Return the size (bytes) of a regular file, and register the file as an input.
 
@@ -63,9 +78,12 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     ------
     Px4FuseError
         The file is missing, not accessible, or not a regular file; of type ``error_type``.
+    LogError
+        The file is outside :data:`readable_folders`.
     """
     name = name or display_name(path)
     try:
+        check_readable(path, readable_folders.get())
         status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: the path contains NUL
         suggestion = ""

@@ -6,6 +6,7 @@ ends the pool (BrokenProcessPool), ``multiprocessing.Pool`` waits forever for th
 process, and Pebble's pool (5.2) ends if a process dies before its job is registered.
 """
 
+import math
 import multiprocessing
 import os
 import pickle
@@ -104,6 +105,19 @@ def run_bounded(
     (int, object)
         Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
     """
+    with closing(poll_bounded(function, jobs, processes, timeout_s, memory_bytes)) as outcomes:
+        yield from (outcome for outcome in outcomes if outcome is not None)
+
+
+def poll_bounded(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int | None,
+    timeout_s: float,
+    memory_bytes: int | None,
+    max_wait_s: float = math.inf,
+) -> Generator[tuple[int, Result | JobFailure] | None]:
+    """Run jobs as :func:`run_bounded` does; yield None if no job finishes within ``max_wait_s``."""
     waiting_jobs = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
@@ -114,7 +128,10 @@ def run_bounded(
                 workers[new_worker.pipe] = new_worker
             # the wait ends at the first deadline or if a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
-            ready_pipes = wait(workers, max(0.0, first_deadline - time.monotonic()))
+            remaining_s = max(0.0, first_deadline - time.monotonic())
+            ready_pipes = wait(workers, min(remaining_s, max_wait_s))
+            if not ready_pipes and remaining_s > 0.0:
+                yield None
             for pipe, worker in list(workers.items()):
                 if pipe in ready_pipes:
                     is_usable, result = _receive_result(worker)

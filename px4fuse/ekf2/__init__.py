@@ -1,1 +1,1 @@
-"""EKF2 replay from a default log: model, agreement with the log, and other parameters (what-if)."""
+"""Replay of PX4's EKF2 from a log, with the logged or with other parameters."""

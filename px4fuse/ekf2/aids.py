@@ -1,6 +1,6 @@
 """Consistency of each aiding source of EKF2, tested with the logged innovations.
 
-Definitions: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
+Statistics: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
 ``EKF/ekf_helper.cpp``, v1.13 to main.
 """
 
@@ -26,13 +26,11 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum ratio of |mean innovation| to RMS innovation for the verdict that an aiding source is
-# biased
-MIN_BIAS_SHARE = 0.5
-# Minimum |mean innovation| (√S) for the verdict that an aiding source is biased
+# Minimum |mean innovation| ÷ RMS innovation of a biased aiding source
+MIN_BIAS_RATIO = 0.5
+# Minimum |mean innovation| (√S) of a biased aiding source
 MIN_BIAS_IN_SIGMA = 0.2
-# Length (s) of the windows in which the normalised innovations ν/√S are averaged, to detect a
-# change of their mean in flight
+# Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
 WINDOW_S = 10.0
 # Minimum number of innovations in a window
 MIN_WINDOW_SAMPLES = 5
@@ -40,20 +38,17 @@ MIN_WINDOW_SAMPLES = 5
 MIN_WINDOWS_BEFORE = 2
 # Minimum change (√S) of the mean normalised innovation
 MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum ratio of a change of the mean normalised innovation to the standard deviation of the means
-# of the earlier windows
+# Minimum change of the mean, in standard deviations of the means of the earlier windows
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
 NOT_FUSED_LIMIT_S = 5.0
-# Maximum time without a fused sample of an enabled aiding source, as a multiple of the median
-# interval between logged samples: topics may be logged at a reduced rate
+# The same limit as a multiple of the logging interval, for topics with a reduced rate
 NOT_FUSED_INTERVALS = 10.0
-# Maximum relative difference between √R and a noise parameter, to conclude that R is from this
-# parameter
+# R is from a noise parameter if √R differs by less than this fraction
 NOISE_TOLERANCE = 0.02
-# Minimum height (m) above ground at which innovations are evaluated, or half of the maximum height
-# of a low flight: rotor downwash disturbs the barometer, and PX4's land detector may fail
+# Minimum evaluated height (m) above ground: rotor downwash disturbs the barometer. In a low flight
+# it is half of the maximum height
 MIN_HEIGHT_M = 2.0
 # Number of barometer samples in a running median, which removes noise and gusts
 HEIGHT_MEDIAN_SAMPLES = 11
@@ -65,19 +60,13 @@ class AidAxis(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     samples : int
-        Number of samples that EKF2 fused or rejected while the aiding source was enabled.
-    innovation_mean, innovation_std : float
+        Number of fused and rejected samples.
     s_sqrt_median : float
         Median of √S.
-    nis_mean, nis_band, sigma_ratio
-        See :class:`~px4fuse.filter.consistency.NisVerdict`.
     rejected_fraction : float
         Fraction of samples outside the gate along this axis.
-    lag1_autocorrelation, ljung_box_p, bias_p : float
-        See :class:`~px4fuse.filter.consistency.Consistency`.
     change : (float, float) or None
-        Time (s) and amount (√S) of the largest significant change in flight of the mean normalised
-        innovation ν/√S.
+        Time (s) and size (√S) of the largest significant change of the mean innovation.
     """
 
     samples: Count
@@ -95,7 +84,6 @@ class AidAxis(Record, frozen=True, kw_only=True):
 
     @property
     def mean_normalised_innovation(self) -> float:
-        """Mean innovation divided by the median √S."""
         return self.innovation_mean / self.s_sqrt_median
 
 
@@ -104,30 +92,22 @@ class AidResult(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    label, unit, topic : str
     enabled_fraction : float or None
-        Fraction of the flight time in which EKF2 enabled the aiding source; None if not logged.
-    fused_fraction : float
-        Fraction of the samples that EKF2 fused, while the aiding source was enabled.
+        Fraction of the flight in which the source was enabled; None if not logged.
+    fused_fraction, rejected_fraction : float
+        Fractions of the samples while the source was enabled.
     fused_logged : bool
-        True if the log contains EKF2's decision (fused or not) on each sample; False if px4fuse
-        applies the gate instead.
-    rejected_fraction : float
-        Fraction of the samples that EKF2 rejected along any axis, while the source was enabled.
+        False if px4fuse applied the gate, because the log lacks EKF2's decisions.
     longest_gap_s : (float, float)
-        Start and end of the longest time without a fused sample, among the times that began while
-        the aiding source was enabled.
+        Start and end of the longest time without a fused sample, while enabled.
     resets : int
-        Number of resets of EKF2's state to the aiding source; samples of resets are excluded.
+        Number of resets of EKF2's state to a sample of the source.
     gate : float
         Innovation gate in √S.
     noise : float or None
-        Median √R; None if R is not logged.
+        Median √R.
     noise_from : str
-        Origin of R: a parameter name, or the reported accuracy; empty if R is not logged.
-    verdict : str
-    axes : mapping from axis to AidAxis
-        Statistics by axis; empty with too few samples.
+        Parameter from which R is, or the reported accuracy.
     """
 
     label: str
@@ -147,14 +127,13 @@ class AidResult(Record, frozen=True, kw_only=True):
 
     @property
     def longest_gap_duration_s(self) -> float:
-        """Duration (s) of the longest time without a fused sample."""
         return self.longest_gap_s[1] - self.longest_gap_s[0]
 
     @property
     def is_faulty(self) -> bool:
-        """True if the aiding source is biased, overconfident, or enabled but not fused.
+        """True if the source is biased, overconfident, or enabled but not fused.
 
-        An underconfident source is not a fault: PX4's default settings are underconfident.
+        PX4's default settings are underconfident, so this is not a fault.
         """
         return self.verdict in ("not_fused", "biased", "overconfident")
 
@@ -171,7 +150,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
     if not flight.airborne:
         return Unavailable("EKF2 aids", "the vehicle never took off", "Record a flight.")
     start, end = longest_flight(flight.airborne)
-    # the barometer, because the height of EKF2 may be the fault
+    # use the barometer, because EKF2's height may be faulty
     if flight.barometer is not None:
         down = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
         height = (down.dropna().iloc[0] if down.notna().any() else 0.0) - down
@@ -183,14 +162,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
 
 
 def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
-    """Evaluate all logged aiding sources of EKF2 in flight.
-
-    Returns
-    -------
-    mapping from PX4's name of the aiding source to AidResult, or Unavailable
-        In the order of :data:`~px4fuse.flight.ekf2_parameters.AIDS`. Unavailable without EKF2,
-        without innovations, or without a flight.
-    """
+    """Evaluate all logged aiding sources of EKF2 in flight, by PX4's name."""
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
@@ -282,11 +254,10 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
 
 
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
-    """Detect the largest change of the mean normalised innovation; return time (s) and amount (√S).
+    """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    For each window, the mean of the two windows after it is compared with the mean of all windows
-    before it. The change begins in the window if the window's mean differs from the mean before by
-    at least a third of the change. Return None without a significant change.
+    For each window, the mean of the two windows after it is compared with all windows before it.
+    The change begins in the window itself if that mean already shows a third of the change.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     windows = pd.Series(normalised).groupby(window).agg(["mean", "size"])
@@ -324,7 +295,7 @@ def _effective_gate(aid: Aid, log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
-    """Return the name of the parameter that equals √R, or the text ``Aid.noise_origin``."""
+    """Return the parameter whose value is √R, else the origin stated for the source."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
         return "" if noise is None else aid.noise_origin
@@ -360,7 +331,7 @@ def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> A
     if not axes:
         return "too few samples"
     for axis in axes.values():
-        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_SHARE * math.sqrt(axis.nis_mean))
+        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_RATIO * math.sqrt(axis.nis_mean))
         if abs(axis.mean_normalised_innovation) > min_bias:
             return "biased"
     return classify_mean_nis(_mean_nis(axes), nis_band(sum(axis.samples for axis in axes.values())))

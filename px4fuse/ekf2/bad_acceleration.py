@@ -1,9 +1,9 @@
 """EKF2's flag for a bad vertical acceleration (``fs_bad_acc_vertical``), from innovations.
 
-EKF2 sets the flag if the barometer and GNSS both show that the vehicle is above the state: one
-innovation is above 3 √S, and one of the other sensor above √S. EKF2 resets the flag some seconds
-after the last such innovation. While it is set, the accelerometer noise is increased, the
-accelerometer bias is constant, and vertical innovations outside the gate are clipped and fused.
+EKF2 sets the flag if barometer and GNSS both measure a larger height than the state, one of them by
+more than 3 √S, the other by more than √S. While the flag is set, the accelerometer noise is
+increased, the accelerometer bias is constant, and vertical innovations outside the gate are clipped
+instead of rejected.
 
 Source: PX4-Autopilot ``EKF/height_control.cpp`` (checkVerticalAccelerationHealth,
 estimateInertialNavFallingLikelihood).
@@ -26,9 +26,9 @@ class BadAcceleration:
     Parameters
     ----------
     follows_log : ndarray of bool, shape (S,)
-        True for filter configurations with the logged flag.
+        True for configurations that use the logged flag.
     duration_s : float
-        Time from the last sign of a bad acceleration to the reset of the flag.
+        Time for which the flag remains set after the last innovation that sets it.
     segment : ReplaySegment
         Segment with the logged flag.
 
@@ -37,7 +37,7 @@ class BadAcceleration:
     since_s, until_s : ndarray, shape (S,)
         Start and end of the latest time with the flag.
     models_flag : bool
-        True if the flag of any filter configuration is modelled.
+        True if any configuration does not use the logged flag.
     """
 
     def __init__(self, follows_log: BoolArray, duration_s: float, segment: ReplaySegment) -> None:
@@ -53,11 +53,10 @@ class BadAcceleration:
         self.since_s = np.full(len(follows_log), time_s[0])
         self.until_s = np.full(len(follows_log), time_s[0] + duration_s * float(is_logged[0]))
 
-    def share(self, begin_s: Array, end_s: Array) -> Array | None:
-        """Return the fraction of an interval in which the flag is set; None if it is not set.
+    def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
+        """Return the fraction of an interval with the flag, per configuration; None without a flag.
 
-        Call this method for successive intervals: a flag that follows the log gets the logged value
-        at the end of the interval.
+        To be called for successive intervals.
         """
         if len(self.logged_since_s):
             row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -77,20 +76,19 @@ class BadAcceleration:
         time_s : ndarray, shape (S,) or (1,)
             Time of the event.
         previous_ratios, ratios : ndarray, shape (k + 1, S)
-            State minus measurement (down) in √S, at the previous event and at this event: of the
-            barometer samples before the event, and the larger one of GNSS height and GNSS velocity.
-            NaN without a sample.
+            Measured height above the state, in √S, at the previous and at this event: of k
+            barometer samples, then of GNSS. NaN without a sample.
         """
         # an innovation is valid until the next innovation of the same sensor
         gnss = previous_ratios[-1]
-        pressure = np.full(len(gnss), np.nan)
+        barometer = np.full(len(gnss), np.nan)
         for ratio in previous_ratios[:-1]:
-            pressure = np.where(np.isnan(ratio), pressure, ratio)
-        is_bad = _is_falling(pressure, gnss)
+            barometer = np.where(np.isnan(ratio), barometer, ratio)
+        is_bad = _is_falling(barometer, gnss)
         for ratio in ratios[:-1]:
-            pressure = np.where(np.isnan(ratio), pressure, ratio)
-            is_bad |= _is_falling(pressure, gnss)
-        is_bad |= _is_falling(pressure, ratios[-1])
+            barometer = np.where(np.isnan(ratio), barometer, ratio)
+            is_bad |= _is_falling(barometer, gnss)
+        is_bad |= _is_falling(barometer, ratios[-1])
         is_bad &= ~self.follows_log
         self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_bad, time_s + self.duration_s, self.until_s)

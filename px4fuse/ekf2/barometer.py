@@ -1,10 +1,9 @@
 """Barometer samples that EKF2 fused, including samples that the logger dropped.
 
-The default logging profile has 5 of 10 or 20 samples per second in ``vehicle_air_data``. Each row
-of ``estimator_aid_src_baro_hgt`` contains another sample (without EKF2's bias), and each row of
-``estimator_baro_bias`` the innovation of another one. From PX4 v1.16 on, the low-pass filtered
-innovation determines the mean of the samples that are missing between two rows; only their scatter
-is simulated.
+PX4's default profile logs 5 of 10 or 20 samples per second. Further samples are found in two EKF2
+topics: ``estimator_aid_src_baro_hgt`` and ``estimator_baro_bias`` (as innovation). From PX4 v1.16
+on, the logged low-pass filtered innovation gives the mean of the samples that are still missing;
+only their scatter is simulated.
 
 Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
 ``EKF/aid_sources/barometer/baro_height_control.cpp``, ``EKF/bias_estimator/bias_estimator.cpp``.
@@ -20,19 +19,17 @@ from px4fuse.ekf2.replay_segments import INNOVATION_FILTER_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 
-# Rate (Hz) at which EKF2 of PX4 v1.15 and later fuses the barometer, if the variance of the
-# barometer bias does not show the rate
+# Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 OLD_BAROMETER_HZ = 15.0
 # Maximum relative interquartile range of sample intervals that are computed from the bias variance
 MAX_INTERVAL_SCATTER = 0.1
-# Maximum difference of two times that belong to the same sample, in sample intervals
+# Two times belong to the same sample if they differ by less than this fraction of an interval
 MATCH_TOLERANCE = 0.3
-# Maximum number of samples between two rows of the log for reconstructing the samples from the
-# filtered innovation
+# Maximum number of samples between two logged rows that are reconstructed
 MAX_SAMPLES_PER_ROW = 30
-# Maximum number of missing samples for which one sample stands
+# Maximum weight of a sample, which replaces missing samples beside it
 MAX_WEIGHT = 4.0
 # Minimum weight of missing samples, to avoid a division by zero
 MIN_WEIGHT = 1e-9
@@ -41,8 +38,8 @@ MIN_WEIGHT = 1e-9
 def sample_interval_s(record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
-    In the steady state, an update reduces the variance of the barometer bias by as much as it has
-    grown since the previous sample: p' = p - p²/S and p = p' + q² Δt.
+    In the steady state, an update reduces the variance of the barometer bias as much as the random
+    walk increases it between samples: p' = p - p²/S and p = p' + q² Δt.
     """
     bias = record.height_bias.get(BAROMETER.name)
     if bias is not None and len(bias) > 1:
@@ -66,8 +63,8 @@ def _bias_gain(bias: pd.DataFrame) -> Array:
 def fused_samples(ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]") -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
 
-    The columns are ``down_m`` (height) and ``weight``: 1, or more beside samples that remain
-    missing. ``logged`` is the logged height (m, down) of the barometer at measurement times.
+    Columns: ``down_m`` (height) and ``weight``, which is above 1 if samples beside it are missing.
+    ``logged`` is the logged height (m, down) at measurement times.
     """
     interval_s = sample_interval_s(record)
     samples = _known_and_simulated_samples(ekf2, record, logged, interval_s)
@@ -103,7 +100,7 @@ def _known_and_simulated_samples(
         return np.asarray(np.interp(time_s, bias_s, fused_bias_m))
 
     def prediction_m(time_s: Array) -> Array:
-        """Return EKF2's prediction of the logged height, including motion between logged rows."""
+        """Return EKF2's prediction of the measured height."""
         state_m = np.interp(time_s, calm.index, still_m) + np.interp(time_s, velocity_s, moved_m)
         return np.asarray(state_m - bias_m(time_s))
 
@@ -115,7 +112,7 @@ def _known_and_simulated_samples(
     sample_s = span_s / count
     column = np.arange(count[is_regular].max(initial=1))
     innovation_m = np.full((len(count), len(column)), np.nan)
-    # the same sample may be in several topics; the last topic is then preferred
+    # a sample may be in several topics; later topics overwrite earlier ones
     time_s = np.concatenate([bias.index, logged.index, row_s])
     down_m = np.concatenate(
         [
@@ -154,26 +151,26 @@ def _known_and_simulated_samples(
 def _with_missing_innovations(
     innovation_m: Array, is_missing: BoolArray, interval_s: Array, age: Array, filtered_m: Array
 ) -> Array:
-    """Simulate missing innovations such that their low-pass filtered value is as logged.
+    """Simulate missing innovations that agree with the logged low-pass filtered innovation.
 
     Parameters
     ----------
     innovation_m, is_missing : ndarray, shape (n, k)
-        Innovations of the k samples before each of n rows of the log.
+        Innovations of the k samples before each of n logged rows.
     interval_s : ndarray, shape (n, 1)
         Time between two samples.
     age : ndarray, shape (n, k)
-        Number of samples from each sample to the row.
+        Number of samples from each sample to its row.
     filtered_m : ndarray, shape (n + 1,)
-        Low-pass filtered innovation at the start and at each row.
+        Low-pass filtered innovation, at the start and at each row.
     """
-    share = interval_s / (interval_s + INNOVATION_FILTER_S)
-    weight = share * (1.0 - share) ** np.maximum(age, 0.0)
+    new_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
+    weight = new_weight * (1.0 - new_weight) ** np.maximum(age, 0.0)
     missing_weight = weight * is_missing
     scatter_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    decay = (1.0 - share[:, 0]) ** (age[:, 0] + 1.0)
+    decay = (1.0 - new_weight[:, 0]) ** (age[:, 0] + 1.0)
     known_m = np.nansum(weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(axis=1)
     offset_m = filtered_m[1:] - decay * filtered_m[:-1] - known_m
     offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT)

@@ -16,8 +16,8 @@ BIAS_DENSITY = 0.13
 MIN_VARIANCE_M2 = 1e-8
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
-# Maximum |mean| of test ratio times sign of the innovation: if it is larger, EKF2 multiplies the
-# variance of the random walk by RANDOM_WALK_FACTOR (isOffsetDetected)
+# If |mean of test ratio · sign of the innovation| is larger, EKF2 multiplies the random walk
+# variance by RANDOM_WALK_FACTOR (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
 RANDOM_WALK_FACTOR = 1e3
 # Time constant (s) of the low-pass filter that averages the signed test ratio
@@ -27,12 +27,8 @@ TEST_RATIO_FILTER_S = 10.0
 class BiasEstimator:
     """Bias of one sensor along k axes in S filter configurations, updated with each sample.
 
-    Parameters
-    ----------
-    value_m, variance_m2 : ndarray, shape (S,) or (S, k)
-        Initial bias (it is added to innovations), and variance of the bias.
-    step_s : float
-        Prediction step of EKF2.
+    ``value_m`` (added to innovations) and ``variance_m2`` have shape (S,) or (S, k); ``step_s`` is
+    EKF2's prediction step.
     """
 
     def __init__(self, value_m: Array, variance_m2: Array, step_s: float) -> None:
@@ -55,10 +51,10 @@ class BiasEstimator:
         Parameters
         ----------
         nu, predicted_variance, noise_m2 : ndarray
-            Innovation without the bias (m), HPH' and R (m²).
-        interval_s, updates_bias : ndarray
-            Per filter configuration: time (s) since the previous sample, or 0 if the bias is not
-            updated; True to update the bias.
+            Uncorrected innovation (m), HPH' and R (m²).
+        interval_s : ndarray
+            Time (s) since the previous sample; 0 if the bias is not updated.
+        updates_bias : ndarray of bool
         weight : float or ndarray, shape (S,)
             Number of samples that EKF2 fused per known sample.
         """

@@ -1,11 +1,10 @@
 """Earth rotation rate and radii of curvature of the earth, as used by EKF2.
 
-From PX4 v1.16 on EKF2's state contains latitude and longitude. EKF2 converts them to metres with
-the radii of curvature of an ellipsoid, but publishes positions in metres on a sphere.
+From PX4 v1.16 on, EKF2's state contains latitude and longitude. EKF2 converts them to metres on an
+ellipsoid, but publishes positions in metres on a sphere.
 
-Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; PX4's meridian
-radius uses q to the power 2.5, an ellipsoid's has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
-``EKF/ekf.cpp`` (predictState).
+Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature),
+``EKF/ekf_helper.cpp`` (calcEarthRateNED), ``EKF/ekf.cpp`` (predictState).
 """
 
 import numpy as np
@@ -25,11 +24,12 @@ def earth_rate_rad_s(record: FusionRecord) -> Array:
 
 
 def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
-    """Return the scale of EKF2's internal position relative to the published one, for each axis."""
+    """Return EKF2's internal position ÷ published position along north, east and down."""
     if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(record.latitude_deg)) ** 2
+    # PX4 uses the exponent 2.5 instead of 1.5 of an ellipsoid
     radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + record.altitude_m

@@ -1,9 +1,10 @@
 """Filter recursion of the EKF2 replay: several filter configurations run through one segment.
 
-A filter configuration consists of parameters, estimated states and fused aiding sources. An event
-is the end of an interval without measurements: a position sample is fused at this time or, in a gap
-of the position source, only height and heading. Array shapes: E events, S filter configurations, n
-states. x, P: state and covariance; R: measurement noise; S in an equation: innovation variance.
+The flight is divided into intervals. At the end of an interval (an "event") the filter fuses a
+position or, in a gap of the position source, only height and heading.
+
+Symbols: E events, S filter configurations, n states in array shapes; x, P: state and covariance; R:
+measurement noise; S in an equation: innovation variance.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
@@ -42,13 +43,13 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 MIN_STATE_VARIANCE = 1e-30
 # Number of events for which transition matrices are copied at once: more events need more memory
 EVENT_BATCH_SIZE = 64
-# Measurement variance (m² or rad²) that is so large that the measurement has no effect
+# Measurement variance (m² or rad²) of a measurement without effect
 IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
-# Beginnings of the names of parameters without effect on vertical innovations: with other values of
-# these parameters the logged flag for a bad acceleration remains valid
+# Parameters with these prefixes do not change vertical innovations, so the logged flag for a bad
+# acceleration remains valid
 NO_EFFECT_ON_HEIGHT = (
     "EKF2_EV",
     "EKF2_MAG",
@@ -80,7 +81,7 @@ LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
 # State indices of velocity and position, both of which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
-# Columns of velocity and of horizontal position in arrays of the six MEASURED_STATES
+# Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
 VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
 POSITION_COLUMNS = slice(3, 5)
 
@@ -94,21 +95,21 @@ class FilterConfiguration:
     settings : dict
         Values of all EKF2 parameters in the model, by PX4 name.
     estimates_biases : bool
-        True if the accelerometer bias is a state; else the bias is 0.
+        False without an accelerometer bias.
     estimates_attitude : bool
-        True if attitude and gyro bias are states; else the published attitude is used.
+        False to use the published attitude instead of attitude and gyro bias states.
     fuses_velocity : bool
-        True to fuse velocity in flights in which EKF2 fuses velocity.
+        False to ignore the velocity of the position source.
     uses_reported_noise : bool
-        True to use the variance reported by the position source if EKF2 uses the reported variance.
+        False to ignore the variance that the position source reports.
     has_gate : bool
-        True if an innovation gate rejects samples and the position is reset after rejections.
+        False to fuse every sample.
     uses_logged_decisions : bool
-        True if EKF2's logged rejections and resets are used instead of the gate.
+        True to use EKF2's logged rejections and resets instead of the gate.
     without : mapping from PX4's name of an aiding source to float
-        Time (s) from which the aiding source is not fused.
+        Time (s) from which the source is not fused.
     timestamp_offset_s : float or None
-        Time (s) to add to the timestamps of positions; None to subtract EKF2's delay parameter.
+        Time (s) to add to the timestamps of positions instead of EKF2's delay parameter.
     """
 
     settings: dict[str, float]
@@ -122,13 +123,13 @@ class FilterConfiguration:
     timestamp_offset_s: float | None = None
 
     def has_logged_bad_acceleration(self, inputs: Inputs) -> bool:
-        """Return True if the logged flag for a bad acceleration is valid with these parameters."""
+        """Return True if these parameters do not change the logged flag for a bad acceleration."""
         changed = {name for name, value in self.settings.items() if value != inputs.settings[name]}
         has_same_heights = all(name.startswith(NO_EFFECT_ON_HEIGHT) for name in changed)
         return self.uses_logged_decisions or (has_same_heights and not self.without)
 
     def timing(self, inputs: Inputs) -> Timing:
-        """Return the age of a position at its timestamp, and the delay of the fusion horizon."""
+        """Return the delay of a position, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
@@ -148,37 +149,28 @@ class FilterConfiguration:
 
 @dataclass(frozen=True)
 class SegmentRun:
-    """Results of S filter configurations in one segment with E events (ends of intervals).
+    """Results of S filter configurations in one segment with E events.
 
     Attributes
     ----------
-    segment : ReplaySegment
-    configurations : tuple of FilterConfiguration
     events : tuple of recarray
-        Events of each filter configuration, see :data:`~px4fuse.ekf2.intervals.EVENT`.
-    innovation : ndarray, shape (E, S, 6)
-        Measurement minus state of velocity (m/s) and position (m), NED; NaN without a sample or
-        without velocity fusion.
-    innovation_variance : ndarray, shape (E, S, 6)
-        Innovation variance, P + R.
-    noise : ndarray, shape (E, S, 6)
-        Measurement noise R.
+        Events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT`.
+    innovation, innovation_variance, noise : ndarray, shape (E, S, 6)
+        ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (E, S)
         Decisions on the position sample of each event.
     position_reset_m : ndarray, shape (E, S, 2)
-        Change of the position by a reset at each event, north and east.
+        Change of the position by resets, north and east.
     state, variance : ndarray, shape (E + 1, S, n)
-        State and its variance at the start and after each event; n is 15, or 21 with magnetic
-        fields as states.
+        State and its variance at the start and after each event.
     covariance : ndarray, shape (S, n, n)
-        Covariance at the end of the segment.
+        Covariance at the end.
     field : ndarray, shape (E, 3, S, 3)
-        Magnetometer (body FRD): innovation (gauss), its variance for one sample, and 1 if fused;
-        NaN without a sample. Empty if magnetic fields are not states.
+        Magnetometer (body FRD): innovation (gauss), its variance, and 1 if fused.
     heights : HeightFilter or None
-        Height fusion; None if the logged EKF2 height is used.
+        None if the logged EKF2 height is used.
     vision : VisionFilter or None
-        Vision fusion in addition to GNSS; None without it.
+        Vision fusion in addition to GNSS.
     """
 
     segment: ReplaySegment
@@ -207,18 +199,25 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 ) -> SegmentRun:
     """Run filter configurations through one segment.
 
-    ``intervals`` contains the intervals between fusion events, one element per configuration.
+    ``intervals`` contains the intervals between events, one element per configuration.
     """
     configuration_count = len(configurations)
-    events = len(intervals[0].events)
+    event_count = len(intervals[0].events)
     parameters = {
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    for name, value in segment.changed.items():  # a chosen value applies to the whole flight
+    for name, value in segment.changed.items():  # parameters that were changed in flight
         is_flown = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_flown, value, parameters[name])
-    biases, attitude, has_gate, uses_logged_decisions, uses_reported_noise, fuses_velocity = (
+    (
+        has_biases,
+        has_attitude,
+        has_gate,
+        uses_logged_decisions,
+        uses_reported_noise,
+        fuses_velocity,
+    ) = (
         np.array([getattr(configuration, name) for configuration in configurations])
         for name in (
             "estimates_biases",
@@ -240,9 +239,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         arrays = [getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals]
         return np.stack(arrays, axis=1)[:, configuration_intervals]
 
-    event = stacked("events")
-    action = np.where(has_gate, event["action"], np.where(event["usable"], FUSE, IDLE))
-    event_steps = event["end_step"]
+    event_table = stacked("events")
+    action = np.where(has_gate, event_table["action"], np.where(event_table["usable"], FUSE, IDLE))
+    event_steps = event_table["end_step"]
     is_active = action > IDLE
     event_time_s = segment.time_s[event_steps]
     has_sample = np.any(is_active, axis=1).tolist()
@@ -274,7 +273,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
     field_samples = heights = flow_samples = vision = None
-    has_field, has_flow = np.zeros((2, events), bool)
+    has_field, has_flow = np.zeros((2, event_count), bool)
 
     def enabled_means(source_aid: Aid, samples: Sequence[EventSamples]) -> EventSamples:
         stacked_fields = (
@@ -310,7 +309,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         heights = HeightFilter(
             segment,
             barometer,
-            event["time_s"],
+            event_table["time_s"],
             is_active,
             enabled,
             parameters,
@@ -331,24 +330,26 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         vision = VisionFilter(
             segment, vision_by_configuration, enabled, parameters, has_gate, uses_reported_noise
         )
-    gyro_variance = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
+    gyro_variance = np.where(has_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     variance_increment, variance_limit = _variance_growth(
-        inputs, segment, parameters, biases, attitude
+        inputs, segment, parameters, has_biases, has_attitude
     )
     steps = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (events, 1))[
+    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))[
         :, :, None, None
     ]
-    if (share := segment.clipped_share) is not None:
-        # mean fraction of accelerometer axes in each interval that have BAD_ACCELERATION_NOISE
-        share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
-        mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
-        acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
-    x, P = _start_state(segment, biases, attitude)
+    if (clipped_fraction := segment.clipped_fraction) is not None:
+        # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
+        fraction_sums = np.diff(
+            np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
+        )
+        mean_fraction = (fraction_sums[:, :, None] / np.maximum(steps, 1))[..., None]
+        acceleration_variance += mean_fraction * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
+    x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # while EKF2 declared its acceleration bad, the log contains no bias estimate:
-        # configurations that do not follow the log start with a bias from the published velocity
-        has_bias = ~bad_acceleration.follows_log & biases
+        # the log contains no bias estimate while EKF2 declared its acceleration bad: start with the
+        # bias from the published velocity
+        has_bias = ~bad_acceleration.follows_log & has_biases
         P[has_bias, BIAS_DOWN, :] = 0.0
         P[has_bias, :, BIAS_DOWN] = 0.0
         P[has_bias, BIAS_DOWN, BIAS_DOWN] = INITIAL_BIAS_SIGMA_M_S2**2
@@ -357,7 +358,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     is_aid_enabled = enabled[inputs.aid.name]
     action_inputs = (
         np.where(is_aid_enabled, action, IDLE),
-        event["can_start"] & is_aid_enabled,
+        event_table["can_start"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
@@ -369,27 +370,27 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         *logged_decisions,
         inputs.received.has_all_resets,
     )
-    innovations, variances = np.full((2, events, configuration_count, 6), np.nan)
+    innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
     field_record = np.full(
-        (0 if field_samples is None else events, 3, configuration_count, 3), np.nan
+        (0 if field_samples is None else event_count, 3, configuration_count, 3), np.nan
     )
-    is_rejected, is_fused, reset = np.zeros((3, events, configuration_count), bool)
-    position_reset_m = np.zeros((events, configuration_count, 2))
-    states, state_variances = np.empty((2, events + 1, configuration_count, x.shape[1]))
+    is_rejected, is_fused, reset = np.zeros((3, event_count, configuration_count), bool)
+    position_reset_m = np.zeros((event_count, configuration_count, 2))
+    states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
     states[0] = x
     state_variances[0] = _diagonal(P)
     innovation, R = np.empty((2, configuration_count, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
-    for e in range(events):
+    for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
             transition = stacked("transition", event_batch)
-            state_input = stacked("acceleration_input", event_batch) + attitude[:, None] * stacked(
-                "correction_input", event_batch
-            )
+            state_input = stacked("acceleration_input", event_batch) + has_attitude[
+                :, None
+            ] * stacked("correction_input", event_batch)
             added_noise = gyro_variance * stacked("gyro_noise", event_batch)
             accelerometer_noise = stacked("accelerometer_noise", event_batch)
             added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
@@ -401,9 +402,13 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         is_bias_constant = None
-        share = bad_acceleration.share(event_time_s[e - 1] if e else start_s, event_time_s[e])
-        if share is not None:
-            increase = share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0])
+        flagged_fraction = bad_acceleration.flagged_fraction(
+            event_time_s[e - 1] if e else start_s, event_time_s[e]
+        )
+        if flagged_fraction is not None:
+            increase = flagged_fraction * (
+                BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0]
+            )
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 increase[:, None, None] * accelerometer_noise[batch_index]
             )
@@ -413,7 +418,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
         if inputs.rules.min_bias_variance is not None:
-            _limit_bias(P, inputs.rules.min_bias_variance, biases)
+            _limit_bias(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
@@ -473,7 +478,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if field_samples is None:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
             R[:, :2] = _noise_to_reach(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
-            heading = np.where(attitude, x[:, HEADING] + innovation[:, 0], 0.0)
+            heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.vision_height or heights is not None:
                 R[:, 1] = IGNORED_VARIANCE
                 if has_sample[e] and heights is None:
@@ -550,10 +555,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 
 
 def _reduce_variance_to(P: Array, row: int, target: Array) -> ArrayPair:
-    """Return Kalman gain and covariance after a scalar update that reduces P[row, row].
-
-    ``target`` is the variance of state ``row`` after the update.
-    """
+    """Return gain and covariance after an update that reduces a state's variance to ``target``."""
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target)
     K = P[:, :, row] / (variance + R)[:, None]
@@ -565,10 +567,9 @@ def _sequential_update(
 ) -> ArrayPair:
     """Fuse the components of a measurement one after the other, like EKF2.
 
-    All components use the innovations and innovation variances from before the first update.
-    Source: fuseDirectStateMeasurement (``ekf_helper.cpp``). The Joseph form is valid for any gain.
-    With c = PH' and K = wc: P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
-    ``is_fused`` has shape (S, number of components).
+    All components use the innovations and innovation variances from before the first update
+    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). With c = PH' and K = wc, the Joseph form is P
+    - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
     weight = is_fused / S
@@ -589,12 +590,11 @@ def _sequential_update(
 
 @dataclass
 class _Fusion:
-    """State machine for rejection, fusion and reset of the position in each filter configuration.
+    """Rejection, fusion and reset of the position, for S configurations and E events.
 
-    Source: updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``). After a time without
-    fusion the position is reset. After several resets in a row fusion stops until a sample with
-    ``can_start``. Arrays have shape (E, S), (S,) or (E,). ``rejected`` and ``reset`` are EKF2's
-    logged decisions.
+    After a time without fusion the position is reset; after several resets in a row fusion stops
+    until a sample with ``can_start``. Source: updateEvPosFusion and startEvPosFusion
+    (``ev_pos_control.cpp``). ``rejected`` and ``reset`` are EKF2's logged decisions.
     """
 
     rules: FusionRules
@@ -614,7 +614,7 @@ class _Fusion:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
-        # True for events at which all configurations fuse or reject by the gate, without a reset
+        # True for events without any reset, start or rejection in the log
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
         )
@@ -622,16 +622,10 @@ class _Fusion:
     def decide(
         self, e: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Return masks of configurations with position rejected, fused, reset; velocity fused.
+        """Decide on the samples of one event, for each configuration.
 
-        Parameters
-        ----------
-        e : int
-            Index of the event.
-        is_outside_gate : ndarray of bool, shape (S,)
-            True if the position innovation is outside the gate.
-        is_velocity_fused : ndarray of bool, shape (S,)
-            True if the velocity innovation is inside its gate.
+        Return masks: position rejected, position fused, position reset, velocity fused.
+        ``is_velocity_fused`` is True if the velocity is inside its gate.
         """
         rules = self.rules
         now_s = self.time_s[e]
@@ -684,9 +678,9 @@ def _variance_growth(
     biases: BoolArray,
     attitude: BoolArray,
 ) -> ArrayPair:
-    """Return the process noise of sensor biases and magnetic fields in one prediction step.
+    """Return the process noise of biases and magnetic fields in one step, and its upper limits.
 
-    Return also the state variances above which EKF2 adds no process noise.
+    EKF2 adds no process noise to a state variance above the limit.
     """
     field_parameters = ("MAG_E", "MAG_B") if segment.field is not None else ()
     noise_density = np.stack(
@@ -739,10 +733,9 @@ def _correlation(P: Array) -> Array:
 
 
 def _settled_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlations of EKF2's state errors after a long time of velocity fusion.
+    """Return the correlations of tilt and accelerometer bias after long velocity fusion.
 
-    Errors of tilt and accelerometer bias become correlated, because their effects on the
-    acceleration cancel: θ × f = Rb.
+    Their effects on the acceleration cancel: θ × f = Rb.
     """
     to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
@@ -755,7 +748,7 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
 
 
 def _diagonal(P: Array) -> Array:
-    """Return the state variances of all filter configurations as a view of P, not a copy."""
+    """Return the state variances of all configurations as a view of P."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
@@ -776,10 +769,10 @@ def _start_state(segment: ReplaySegment, biases: BoolArray, attitude: BoolArray)
 
 
 def _noise_to_reach(variance: Array, target: Array) -> Array:
-    """Return the measurement noise R with which an update reduces a state variance to a target.
+    """Return the R with which an update reduces a state variance to a target.
 
-    1/R = 1/target - 1/variance. Height and heading sensors are logged at a reduced rate. EKF2's
-    published height and heading are fused instead, with an R that reproduces the logged variances.
+    1/R = 1/target - 1/variance. EKF2's published height and heading are fused with this R to
+    reproduce their logged variances.
     """
     surplus = variance - target
     noise = np.full(surplus.shape, IGNORED_VARIANCE)

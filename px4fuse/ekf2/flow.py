@@ -1,9 +1,8 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The log contains a low-pass filtered velocity. It is converted to the mean velocity between two
-logged samples. Each mean is fused at the next event (end of an interval, see
-:mod:`px4fuse.ekf2.intervals`), after adding the velocity change that the IMU measured until the
-event. The range to the ground is EKF2's logged range.
+The logged velocity is low-pass filtered. It is converted to the mean velocity between two logged
+samples, propagated with the IMU to the next event (:mod:`px4fuse.ekf2.filter_recursion`) and fused
+there. The range to the ground is EKF2's logged range.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
 low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
@@ -21,16 +20,7 @@ from px4fuse.flight.model import FLOW_FILTER_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
-    """Add optical flow samples to a segment.
-
-    Parameters
-    ----------
-    segment : ReplaySegment
-    flow : DataFrame
-        Logged optical flow, see :attr:`px4fuse.flight.model.FusionRecord.flow`.
-    gate : float
-        Innovation gate in √S.
-    """
+    """Add the logged optical flow (:attr:`FusionRecord.flow`) to a segment; ``gate`` is in √S."""
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     count = flow["samples"].to_numpy()
@@ -54,8 +44,4 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
 
 
 def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:
-    """Return state and covariance after fusing the mean flow of one event.
-
-    All filter configurations are updated.
-    """
     return fuse_mean(x, P, flow_samples, flow_samples.noise, np.full(len(x), gate), VELOCITY)[:2]

@@ -16,28 +16,26 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.flight.ekf2_parameters import AID_MASK, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, step_values_at
 
-# Maximum interval (s) between two vision samples for EKF2 to start fusion: EV_MAX_INTERVAL of PX4
-# v1.14 and later (ev_control.cpp)
+# EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL of PX4 v1.14
+# and later (ev_control.cpp)
 EV_START_INTERVAL_S = 0.2
-# Maximum time (s) without a vision sample before EKF2 stops fusion: 2 EV_MAX_INTERVAL
+# EKF2 stops vision fusion after this time (s) without a sample: 2 EV_MAX_INTERVAL
 # (ev_pos_control.cpp)
 EV_STOP_INTERVAL_S = 0.4
-# Maximum time (s) without a GNSS sample, or up to v1.13 without a vision sample, before EKF2 stops
-# fusion: reset_timeout_max
+# EKF2 stops GNSS fusion, and before v1.14 vision fusion, after this time (s): reset_timeout_max
 STOP_S = 7.0
 # Maximum value (s) of EKF2's delay parameters
 MAX_HORIZON_S = 1.0
-# Number of position samples that EKF2 buffers: a sample with a timestamp in the future is
-# overwritten after this number of new samples
+# Number of position samples that EKF2 buffers
 BUFFER_COUNT = 20
 # Tolerance (s) in comparisons of intervals: half of the resolution of timestamps
 TIME_STEP_S = 5e-7
 # Time (s) of rejections after which EKF2 stops fusion: no_aid_timeout_max
 GATE_TIME_S = 1.0
-# Maximum range (m) of positions that are constant, because the source does not measure them
+# Positions with a smaller range (m) are constant, so they are no measurement
 MAX_CONSTANT_M = 1e-3
-# Minimum fraction of the time with a failed GNSS check for naming the check as the reason: after
-# each failure EKF2 waits 10 s
+# A GNSS check is the reason if it fails in this fraction of the time: EKF2 waits 10 s after a
+# failure
 MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
@@ -46,8 +44,7 @@ SYNCHRONISE = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Clocks of timestamp_sample that EKF2 cannot use, and the apparent age of positions with these
-# timestamps in EKF2
+# Age that EKF2 computes for positions whose timestamps are from a wrong clock or in a wrong unit
 STAMP_FAULTS = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
     **dict.fromkeys(
@@ -56,8 +53,7 @@ STAMP_FAULTS = {
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
     "nanoseconds": "in the future",
 }
-# GNSS checks by bit of gps_check_fail_flags, each with the parameter and the unit of the limit. In
-# EKF2_GPS_CHECK, the bit of a check is lower by one; EKF2 always checks the fix
+# GNSS checks (by bit of gps_check_fail_flags) with the parameter and unit of the limit
 GNSS_CHECKS = (
     ("3D fix", "", ""),
     ("number of satellites", "EKF2_REQ_NSATS", ""),
@@ -75,18 +71,7 @@ GNSS_CHECKS = (
 
 
 class Unmet(NamedTuple):
-    """Condition of EKF2 that is not met.
-
-    Attributes
-    ----------
-    condition : str
-        Name of the condition; "" if the log does not contain the reason.
-    fault : str
-        Fault for a title.
-    reason : str
-        Sentences with the values of the log and the limits.
-    action : str
-    """
+    """Condition of EKF2 that is not met: its name, a title, an explanation and the action."""
 
     condition: str
     fault: str
@@ -104,7 +89,7 @@ UNKNOWN = Unmet(
 
 @dataclass(frozen=True)
 class Attempt:
-    """Positions that EKF2 did not fuse in the time span ``span_s``; ``parameters`` by PX4 name."""
+    """Positions that EKF2 received but did not fuse in the time span ``span_s``."""
 
     ekf2: Ekf2
     source: PositionTrack
@@ -118,12 +103,12 @@ class Attempt:
 
     @property
     def has_switch(self) -> bool:
-        """True if EKF2 has a parameter to enable this source alone: PX4 v1.14 and later."""
+        """True for PX4 v1.14 and later, where this source has its own parameter to enable it."""
         return self.aid.switch in self.parameters
 
     @property
     def horizon_s(self) -> float:
-        """Maximum age (s) that EKF2 buffers; if not logged, EKF2_DELAY_MAX or MAX_HORIZON_S."""
+        """Maximum age (s) of buffered samples; EKF2_DELAY_MAX or MAX_HORIZON_S if not logged."""
         horizon_s = self.ekf2.horizon_s
         limit_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
         return horizon_s if isinstance(horizon_s, float) else limit_s
@@ -133,11 +118,11 @@ class Attempt:
         return 1.0 / self.source.rate_hz
 
     def within(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples in ``span_s``, and up to ``before_s`` (s) before its start."""
+        """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
     def fraction(self, state: str, bit: int = 0) -> float:
-        """Return the fraction of ``span_s`` in which a bit of a state is set; NaN if not logged."""
+        """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
         steps = self.ekf2.states.get(state)
         if steps is None:
             return float("nan")
@@ -313,6 +298,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
             "Compare both sources. EKF2_GPS_MODE 1 permits a reset to GNSS.",
         )
     parameters, source = attempt.parameters, attempt.source
+    # bits of EKF2_GPS_CHECK are lower by one; the fix is always checked
     mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
     fractions = {bit: attempt.fraction("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
     failed = [bit for bit in fractions if mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION]
@@ -338,7 +324,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0]][0]}",
         f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
         f"{parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
-        "Give the antenna a free view of the sky and wait for the checks before take-off.",
+        "Give the antenna a free view of the sky, and take off only after EKF2 fuses GNSS.",
     )
 
 
@@ -359,8 +345,7 @@ def _check_gate(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-# Vision checks in the order of EKF2, after the switch: the user may have disabled fusion
-# intentionally
+# Vision checks in EKF2's order; first the parameter that enables vision
 VISION_CONDITIONS = (
     _check_switch,
     _check_frame,
@@ -371,6 +356,5 @@ VISION_CONDITIONS = (
     _check_alignment,
     _check_gate,
 )
-# GNSS checks in order; the receiver checks precede the gap, because without a fix the log contains
-# no position samples, but the flags of the last checks
+# GNSS checks; those of the receiver precede the gap, because the log has no positions without a fix
 GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)

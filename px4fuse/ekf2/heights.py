@@ -1,9 +1,10 @@
 """Fusion of GNSS and barometer heights in the EKF2 replay.
 
-EKF2 estimates a bias of the sensor that is not the height reference. Barometer samples between two
-events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event. The
-vertical motion from sample to event is computed from the state and the IMU. Array shapes: E events,
-S filter configurations, k samples per event.
+Barometer samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at the later
+event; the vertical motion in between is computed from the state and the IMU. EKF2 estimates a bias
+of the sensor that is not the height reference.
+
+Array shapes: E events, S filter configurations, k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -38,8 +39,7 @@ HEIGHT_AIDS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 DEFAULT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
 HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}
-# Maximum time (s) from the start of the replay to the first logged height bias: the bias is logged
-# at 2 Hz
+# Maximum time (s) from the start of the replay to the first logged height bias, logged at 2 Hz
 MAX_BIAS_LOG_DELAY_S = 1.0
 # Minimum rate (Hz) of the logged barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
@@ -114,10 +114,10 @@ def add_heights(
 def barometer_samples_inside(
     segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array, weight: Array
 ) -> tuple[IntArray, Array, Array, Array, Array]:
-    """Select the barometer samples inside a segment.
+    """Return the barometer samples inside a segment.
 
-    Return for each sample the prediction step after which it is fused, time (s), height (m, down),
-    dead zone (m) and weight.
+    For each sample: prediction step that fuses it, time (s), height (m, down), dead zone (m),
+    weight.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
     measured_at_s, down_m = measured_at_s[is_inside], down_m[is_inside]
@@ -125,12 +125,10 @@ def barometer_samples_inside(
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
-    """Return the barometer samples that are fused at each event, one array per set of events.
+    """Return the barometer samples that are fused at each event, for each array of event steps.
 
-    Each element of ``ends`` contains the prediction steps of E events. Each array has shape (6, k,
-    E). Its rows are height (m, down), see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`;
-    sample age (s); sample time (s); dead zone (m); weight; and 1 for a sample. All are 0 without a
-    sample.
+    Rows of each result, shape (6, k, E): height (m, down), age (s), time (s), dead zone (m),
+    weight, and 1 for a sample; see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`.
     """
     heights = segment.heights
     assert heights is not None
@@ -150,20 +148,16 @@ class HeightFilter:
     barometer : ndarray, shape (6, k, E, S) or (6, k, E, 1)
         Result of :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
-        Measurement time of the GNSS fix of each event, and mask of the events with a fix.
+        Time of the GNSS fix of each event, and mask of the events with a fix.
     enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
-        True while the aiding source is fused.
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate : ndarray of bool, shape (S,)
-        True for filter configurations that apply the gate.
     bad_acceleration : BadAcceleration
-        Flag with which innovations outside the gate are clipped and fused.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k + 2, 3, S)
-        For the k barometer samples, the GNSS height and the vertical GNSS velocity of each event:
-        innovation (measurement minus state), its variance, and 1 if fused.
+        Innovation, S, and 1 if fused: of k barometer samples, GNSS height and GNSS velocity.
     """
 
     def __init__(
@@ -195,7 +189,7 @@ class HeightFilter:
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
-        self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
+        self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
@@ -213,18 +207,18 @@ class HeightFilter:
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
-    def updates(self, sensor: str, configuration: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one filter configuration with one sensor.
+    def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
+        """Return the updates of one filter configuration with one sensor, at measurement times.
 
-        The index is EKF2's measurement time; ``end_s`` is the time of each event.
+        ``end_s`` is the time of each event.
         """
         rows = []
         slots = len(self.down_m)
         for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
             times = self.time_s[slot]
-            has_sample = self.has_sample[slot][:, configuration]
-            measured_s = times[has_sample, min(configuration, times.shape[1] - 1)]
-            updates = self.update_log[has_sample, slot, :, configuration].T
+            has_sample = self.has_sample[slot][:, configuration_index]
+            measured_s = times[has_sample, min(configuration_index, times.shape[1] - 1)]
+            updates = self.update_log[has_sample, slot, :, configuration_index].T
             rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
         measured_s, nu, S, is_fused, end_s = np.hstack(rows)
         columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
@@ -232,7 +226,6 @@ class HeightFilter:
         return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
 
     def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
-        """Return state and covariance after fusing the barometer samples before one event."""
         for slot in range(len(self.down_m)):
             if self.any_sample[slot][e]:
                 age_s = self.age_s[slot, e]
@@ -245,10 +238,7 @@ class HeightFilter:
         return x, P
 
     def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
-        """Return state and covariance after fusing the GNSS height at one event.
-
-        ``gnss_m`` is the GNSS height (m, down), ``gnss_m2`` its measurement variance R (m²).
-        """
+        """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
         if self.any_sample[-1][e]:
             column = P[:, :, DOWN]
             nu = gnss_m - x[:, DOWN]
@@ -257,7 +247,6 @@ class HeightFilter:
         return x, P
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
-        """Update EKF2's flag for a bad vertical acceleration after the samples of one time."""
         update_log = self.update_log[max(e - 1, 0) : e + 1]
         ratios = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
         if (ratios > MIN_LARGER_RATIO).any():
@@ -293,12 +282,12 @@ class HeightFilter:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = predicted_variance + R
         has_sample = self.has_sample[slot, e]
-        is_fused = has_sample & (nu * nu <= self.gate2[sensor_index] * S)
+        is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
                 has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot][e])
             )
-            limit = np.sqrt(self.gate2[sensor_index] * S)
+            limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -limit, limit), nu)
             is_fused |= is_clipped
         update_log = self.update_log[e, slot]

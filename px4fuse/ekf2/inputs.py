@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -49,7 +48,7 @@ from px4fuse.flight.model import (
     step_values_at,
 )
 from px4fuse.flight.position_source import POSITION_FILE
-from px4fuse.readers.common import constant_spans
+from px4fuse.readers.common import flight_spans
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
@@ -67,8 +66,8 @@ VISION_COPY_INTERVALS_S = {
 }
 # Bit of EKF2_AID_MASK that rotates vision positions, up to PX4 v1.13
 ROTATE_VISION_BIT = 64
-# Maximum time difference (s) between a logged innovation and the measurement time of its sample:
-# estimator_aid_src topics contain EKF2's measurement time within about 1 ms
+# Maximum time difference (s) between a logged innovation and its sample: estimator_aid_src topics
+# contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding in comparisons of sample times with times of prediction steps
 STEP_TOLERANCE_S = 1e-4
@@ -80,14 +79,13 @@ GNSS_VELOCITY_BIT = 4
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
-# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms, and longer IMU intervals lose
-# rotation and vibration
+# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Maximum fraction of IMU samples that EKF2 received but the log does not contain, outside gaps
-MAX_LOST_SHARE = 0.1
+# Maximum fraction of IMU samples missing from the log, outside gaps
+MAX_LOST_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Number that stands for "no limit" of position resets in a row, for releases without a limit
+# Number of position resets in a row for releases without a limit
 UNLIMITED_RESETS = 1_000_000
 # Maximum interval (s) between height and heading measurements in a gap of the position source
 MAX_INTERVAL_S = 0.25
@@ -95,26 +93,22 @@ MAX_INTERVAL_S = 0.25
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """Position samples that EKF2 received, in time order; m is the number of samples.
+    """The m position samples that EKF2 received, in time order.
 
     Attributes
     ----------
     stamp_s, arrival_s : ndarray, shape (m,)
         Timestamps and arrival times.
-    position_m : ndarray, shape (m, 3)
-        Position in NED.
-    variance_m2 : ndarray, shape (m, 3)
-        Variance reported by the sender; 0 if not reported.
+    position_m, variance_m2 : ndarray, shape (m, 3)
+        Position in NED, and variance reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
-        Velocity in NED with its variance, if EKF2 fuses velocity with each position.
+        Velocity in NED, if EKF2 fuses it with each position.
     rejected : ndarray, shape (m,)
-        1 if EKF2's gate rejected the sample, else 0; NaN if not logged.
+        1 if EKF2's gate rejected the sample; NaN if not logged.
     reset : ndarray of bool, shape (m,)
-        True if EKF2 reset its position to the sample; False if rejections are not logged.
-    source : str
-        Name of the position track.
+        True if EKF2 reset its position to the sample.
     uses_sender_times : bool
-        True if EKF2 uses the measurement times of the sender instead of the delay parameter.
+        True if EKF2 ignores its delay parameter.
     reset_s : ndarray
         Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
     has_all_resets : bool
@@ -142,26 +136,23 @@ class FusionRules:
     Attributes
     ----------
     start_interval_s : float
-        Maximum interval from the previous sample to a sample with which fusion starts.
+        Fusion starts if two samples arrive within this time.
     stop_s : float
-        Time without a sample after which fusion stops.
+        Fusion stops after this time without a sample.
     reset_s : float
-        Time of rejections after which the position is reset to the sample.
+        The position is reset after this time of rejections.
     max_resets : int
-        Number of resets in a row after which fusion stops, until a sample with which fusion may
-        start.
-    reset_variance_factor : float
-        Ratio of the position variance after a reset to the measurement variance of the sample.
-    resets_velocity : bool
-        True if velocity is reset together with position. Both are then reset after both were
-        rejected for ``reset_s``, or after position was rejected for twice that time.
+        Fusion stops after this number of resets in a row.
     min_bias_variance : float or None
-        Minimum of the accelerometer bias variance (m²/s⁴); None if the release has no minimum.
+        Minimum accelerometer bias variance (m²/s⁴).
     uses_delay_as_horizon : bool
-        True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
-        v1.15).
+        True if the largest delay parameter is the fusion horizon, not EKF2_DELAY_MAX (v1.15).
+    reset_variance_factor : float
+        Position variance after a reset ÷ measurement variance.
+    resets_velocity : bool
+        True if velocity is reset together with position.
     bad_acceleration_s : float
-        Time for which EKF2's flag for a bad vertical acceleration stays set.
+        Time for which the flag for a bad vertical acceleration stays set.
     """
 
     start_interval_s: float
@@ -182,30 +173,23 @@ class Inputs:
     Attributes
     ----------
     settings : dict
-        Logged values of the EKF2 parameters in the model, by PX4 name.
-    segments : tuple of ReplaySegment
+        EKF2 parameters in the model, by PX4 name.
     received : ReceivedPositions
-        Samples of the horizontal position source.
-    aid : Aid
-        EKF2's name and parameters of this position source: GNSS or external vision.
-    rules : FusionRules
-    step_s : float
-        Mean prediction step.
+        Samples of the horizontal position source ``aid``.
+    step_s, predict_s : float
+        Mean and configured prediction step.
     horizon_s : float
         Delay of the fusion horizon.
-    predict_s : float
-        Configured prediction interval, EKF2_PREDICT_US.
     vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
-        Position of the IMU, EKF2_IMU_POS, body FRD.
+        Position of the IMU (EKF2_IMU_POS, body FRD).
     max_interval_s : float
-        Maximum interval between height and heading measurements in a gap of the position source.
-    vision : ReceivedPositions or None
-        External vision that EKF2 fused in addition to GNSS; NaN while disabled.
+        Maximum interval between events in a gap of the position source.
     logged_height_reason : str
-        Reason why the replay of a flight with GNSS uses the logged EKF2 height; empty if it fuses
-        height sensors.
+        Reason why EKF2's logged height is used in a flight with GNSS.
+    vision : ReceivedPositions or None
+        Vision that EKF2 fused in addition to GNSS; NaN while disabled.
     """
 
     settings: dict[str, float]
@@ -228,13 +212,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 ) -> Inputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
-    Parameters
-    ----------
-    flight : Flight
-    doubtful_aids : mapping from PX4's name of an aiding source to str
-        Aiding sources with a replay that disagrees with the log, and the reasons. They are omitted:
-        height sensors are replaced by the logged EKF2 height; without optical flow the replay is
-        interrupted in gaps of the position source.
+    ``doubtful_aids`` are aiding sources, by PX4's name, that the model cannot reproduce, with the
+    reason. The replay omits them.
     """
     imu = flight.imu
     attitude = flight.attitude
@@ -346,10 +325,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples that are missing from the log, outside gaps.
-
-    ``time_s`` are the times of the logged samples.
-    """
+    """Return the fraction of IMU samples that are missing from the log, outside gaps."""
     intervals = np.diff(time_s)
     lost_counts = np.rint(intervals[intervals <= IMU_GAP_S] / np.median(intervals)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
@@ -357,7 +333,6 @@ def lost_imu_fraction(time_s: Array) -> float:
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    """Return Unavailable if too few IMU samples are logged; ``time_s`` are their times."""
     interval = float(np.median(np.diff(time_s)))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -365,7 +340,7 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_SHARE:
+    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
         return Unavailable(
             ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
@@ -394,8 +369,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             resets_together,
             bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
-    # sources of the times: EV_MAX_INTERVAL (ev_control.cpp); no_aid_timeout_max and
-    # reset_timeout_max (common.h)
+    # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     if not fuses_by_mask(record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
@@ -411,10 +385,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return the times at which an aiding source is enabled (1) or disabled (0).
-
-    None if the source was never enabled, or if this is not logged.
-    """
+    """Return the times at which a source is enabled (1) or disabled (0); None if never enabled."""
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -447,8 +418,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         is_enabled = step_values_at(enabled_log, samples.index) > 0.0
         samples = samples[is_enabled]
         velocities = velocities[is_enabled]
-    # the times of the track are measurement times: the delay is added, because the replay subtracts
-    # the delay again
+    # the track has measurement times, from which the replay subtracts the delay again
     flown_settings = effective_settings(parameters, GNSS_POS)
     flown_s = flown_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
@@ -477,7 +447,7 @@ def read_vision(
 ) -> ReceivedPositions | Unavailable:
     """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
-    ``attitude`` is the published attitude, which rotates positions in an FRD frame to NED.
+    The published ``attitude`` rotates positions from an FRD frame to NED.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -535,7 +505,7 @@ def _read_vision_besides_gnss(
     if fuses_by_mask(record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
-            f"{flight.log.firmware} fuses changes of the vision position besides GNSS, which the "
+            f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "
             "model does not contain",
             "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
         )
@@ -571,9 +541,9 @@ def _logged_decisions(
     due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
     log = ekf2.aids[aid.name].samples
     # EKF2 rejected all samples from the last fusion or reset to each row, and in dead reckoning
-    to_rows = [*zip(log["last_fused_s"], log.index, strict=True)] if "last_fused_s" in log else []
-    spans_s = to_rows + (_dead_reckoning_spans(ekf2, record) if aid == EV_POS else [])
-    limits = np.searchsorted(due_s, np.reshape(spans_s, (-1, 2)) + STEP_TOLERANCE_S)
+    to_rows = np.array([log.get("last_fused_s", log.index), log.index]).T
+    in_reckoning = _dead_reckoning_spans(ekf2, record) if aid == EV_POS else to_rows[:0]
+    limits = np.searchsorted(due_s, np.concatenate([to_rows, in_reckoning]) + STEP_TOLERANCE_S)
     for begin, end in limits.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_reset = np.isnan(rejected_flags)
@@ -595,7 +565,7 @@ def _logged_decisions(
     return rejected_flags, reset
 
 
-def _dead_reckoning_spans(ekf2: Ekf2, record: FusionRecord) -> list[Span]:
+def _dead_reckoning_spans(ekf2: Ekf2, record: FusionRecord) -> Array:
     """Return the times (s) without fusion of vision; each ends with a fusion or a reset.
 
     EKF2 reports inertial dead reckoning after DEAD_RECKONING_S without fusion, and immediately if
@@ -604,18 +574,14 @@ def _dead_reckoning_spans(ekf2: Ekf2, record: FusionRecord) -> list[Span]:
     steps = record.states.get(DEAD_RECKONING)
     enabled = ekf2.states.get(EV_POS.name)
     if steps is None or enabled is None:
-        return []
-    spans = constant_spans(steps, np.inf)
-    was_enabled = step_values_at(enabled, np.array([start_s for start_s, _, _ in spans])) > 0.0
-    return [
-        (start_s - DEAD_RECKONING_S * is_enabled, end_s)
-        for (start_s, end_s, is_on), is_enabled in zip(spans, was_enabled, strict=True)
-        if is_on
-    ]
+        return np.zeros((0, 2))
+    spans = np.array(flight_spans(steps == 0.0, np.inf)).reshape(-1, 2)
+    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(enabled, spans[:, 0]) > 0.0)
+    return spans
 
 
 def aid_source(aid: Aid) -> str:
-    """Return the name of the uORB topic with the innovations of an aiding source."""
+    """Return the uORB topic with the innovations of an aiding source."""
     return f"estimator_aid_src_{aid.name}"
 
 

@@ -1,19 +1,18 @@
-"""Intervals between fusion events in the EKF2 replay, with state transition and process noise.
+"""Intervals between events in the EKF2 replay, with state transition and process noise.
 
-An event is the end of an interval: the fusion of a position sample or, in a gap of the position
-source, of height and heading only. E is the number of events.
-
-With changed parameters, attitude and biases of a replay hardly differ from the logged values.
-Therefore the state transition about the nominal (published) attitude is computed once and used for
-all parameter values. All intervals are integrated together, one prediction step at a time.
+An interval ends with an event: the fusion of a position or, in a gap of the position source, of
+height and heading only. The transitions are linearised about the published attitude, so they are
+computed once for all parameters.
 
 Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
-errors of gyro bias b_g and accelerometer bias b_a. The equations are from PX4-Autopilot
-``EKF/python/ekf_derivation/derivation.py`` (predict_covariance), ``EKF/covariance.cpp`` and
-``EKF/ekf.cpp`` (predictState). Δt is the prediction step, a = R f the specific force in NED:
+errors of gyro bias b_g and accelerometer bias b_a. Δt is the prediction step, a = R f the specific
+force in NED:
 
     δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2
+
+Sources: PX4-Autopilot ``EKF/python/ekf_derivation/derivation.py`` (predict_covariance),
+``EKF/covariance.cpp`` and ``EKF/ekf.cpp`` (predictState).
 """
 
 from dataclasses import dataclass
@@ -35,16 +34,15 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# Maximum time (s) from the passage of the fusion horizon to the arrival of a sample that EKF2 still
-# fuses (RingBuffer.h, pop_first_older_than)
+# EKF2 fuses a sample that arrives at most this time (s) after the fusion horizon has passed it
+# (RingBuffer.h, pop_first_older_than)
 MAX_LATENESS_S = 0.1
-# Minimum lateness (s) of a sample for reporting it as fused late: 3 cm at 1 m/s
+# A sample that is fused later than this time (s) is reported as late: 3 cm at 1 m/s
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Number of columns of the sensitivities of the state at the end of an interval: to initial attitude
-# error, gyro bias and accelerometer bias (3 columns each), to the correction of the nominal
-# attitude, and to the acceleration
+# Columns of the effects on the state at the end of an interval: initial attitude error, gyro bias,
+# accelerometer bias (3 each), correction of the nominal attitude, acceleration
 EFFECT_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
@@ -57,8 +55,8 @@ EVENT = np.dtype(
         ("action", np.intp),
         ("usable", bool),  # True if the sample arrived early enough to be fused
         ("can_start", bool),  # True if EKF2 may start fusion with this sample after a stop
-        ("late", bool),  # True if the fusion horizon passed before arrival: fused late
-        ("lost", bool),  # True if the sample arrived too late and is never fused
+        ("late", bool),  # True if the sample was fused late, because it arrived late
+        ("lost", bool),  # True if the sample arrived too late to be fused
         ("time_s", float),  # measurement time in EKF2 (s): timestamp - delay - half a step
     ]
 )
@@ -66,18 +64,17 @@ EVENT = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals between the fusion events of one segment; each ends in one of E events.
+    """Intervals between the E events of one segment.
 
     Attributes
     ----------
     events : recarray, shape (E,)
-        Events with the fields of :data:`EVENT`.
+        Event at the end of each interval, see :data:`EVENT`.
     transition : ndarray, shape (E, 15, 15)
     correction_input, acceleration_input : ndarray, shape (E, 15)
-        Change of the state during an interval due to the correction of the nominal attitude, and
-        due to the acceleration.
+        State changes due to the correction of the nominal attitude, and to the acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
+        Process noise for a sensor noise of 1 rad/s or 1 m/s².
     """
 
     events: Events
@@ -90,17 +87,14 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """Age (s) of a position at its timestamp, and delay (s) of EKF2's fusion horizon."""
+    """Delay (s) of a position, and delay (s) of EKF2's fusion horizon."""
 
     delay_s: float
     horizon_s: float
 
 
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
-    """Compute the intervals between the fusion events of a segment.
-
-    Number and order of the events do not depend on ``timing``.
-    """
+    """Compute the intervals of a segment; the number of events does not depend on ``timing``."""
     events = _events(inputs, segment, timing)
     start = np.append(0, events.end_step[:-1])
     end = events.end_step
@@ -164,7 +158,7 @@ def _actions(
     end: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return the action on each position sample, and a mask of samples that may start fusion.
+    """Return IDLE, FUSE or START for each sample, and a mask of samples that may start fusion.
 
     Source: PX4-Autopilot ``ev_control.cpp``.
     """
@@ -174,7 +168,7 @@ def _actions(
     usable_rows = np.flatnonzero(is_usable)
     interval = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = interval < rules.start_interval_s
-    # age (s) of the previous usable sample, one prediction step before each sample is fused
+    # time (s) without a usable sample before each sample
     gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
@@ -190,10 +184,7 @@ def _actions(
 
 
 def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the sensitivities of attitude, velocity and position at the end of each interval.
-
-    Shape (E, 9, EFFECT_COLUMN_COUNT).
-    """
+    """Return the effects on attitude, velocity and position, shape (E, 9, EFFECT_COLUMN_COUNT)."""
     length = end - start
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
@@ -224,15 +215,15 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
-    """Return the process noise of each interval for unit gyro noise, and unit accelerometer noise.
+    """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
 
-    Closed form for n equal prediction steps d with the mean specific force of the interval. Unit
-    noise adds d² to the variance of attitude or velocity in each step. Gyro noise has a small
-    effect on velocity and position, so only the leading terms are used.
+    Sum over n steps d, with the mean specific force of the interval. Each step adds d² to the
+    variance of attitude or velocity. For velocity and position, only the leading terms of the gyro
+    noise are used.
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # mean sensitivity of velocity to the attitude error in one prediction step
+    # effect of the attitude error on the velocity, in one of n equal steps
     m = tilt / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

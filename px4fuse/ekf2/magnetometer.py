@@ -1,7 +1,8 @@
 """Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
 
-The samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are averaged,
-and their mean is fused at the later event: the attitude error hardly changes between the events.
+The samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are averaged, and their mean
+is fused at the later event, because the attitude error hardly changes in between.
+
 Array shapes: E events, S filter configurations.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
@@ -24,11 +25,17 @@ CROSS = skew(EYE).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
-    """Means of the sensor samples that are fused at each event; shape (E, ...), or (E, S, ...).
+    """Mean of the sensor samples that are fused at each event; shape (E, ...) or (E, S, ...).
 
-    ``value`` is the mean magnetic field (gauss, FRD), or the velocity forward and right (m/s) at
-    the event. ``rotation_to_body`` is the mean rotation from NED to the body axes, ``sample_count``
-    the number of samples that EKF2 received, ``noise`` the variance R of one sample.
+    Attributes
+    ----------
+    value : ndarray
+        Magnetic field (gauss, FRD), or velocity forward and right (m/s).
+    rotation_to_body : ndarray
+        Mean rotation from NED to the body axes.
+    sample_count : ndarray
+    noise : ndarray
+        R of one sample.
     """
 
     value: Array
@@ -40,10 +47,9 @@ class EventSamples(NamedTuple):
 def mean_by_event(
     sensor_samples: SensorSamples, event_steps: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
-    """Return the means of the sensor samples that are fused at each event.
+    """Return the mean of the sensor samples that are fused at each event.
 
-    Velocity samples require ``imu_velocity_m_s``: the velocity change that the IMU measured since
-    the start of the segment (m/s, NED).
+    ``imu_velocity_m_s`` (NED) propagates velocity samples to the event.
     """
     event = np.searchsorted(event_steps, sensor_samples.step)
     is_inside = event < len(event_steps)
@@ -68,11 +74,7 @@ def mean_by_event(
 def fuse_field(
     x: Array, P: Array, field_samples: EventSamples, noise_gauss: Array, gate: Array
 ) -> tuple[Array, Array, Array]:
-    """Return state, covariance and innovations after fusing the field samples of one event.
-
-    The innovations have shape (3, S, 3): innovation (gauss), its variance for one sample, and 1 if
-    fused; NaN without a sample.
-    """
+    """Fuse the mean magnetic field of one event, as :func:`fuse_mean`."""
     R = np.maximum(noise_gauss, MIN_SIGMA_GAUSS) ** 2
     return fuse_mean(x, P, field_samples, R, gate, EARTH_FIELD, BODY_FIELD)
 
@@ -88,18 +90,19 @@ def fuse_mean(
 ) -> tuple[Array, Array, Array]:
     """Fuse the mean of a sensor's samples at one event in all filter configurations.
 
-    Return state, covariance and innovations, see :func:`fuse_field`.
+    Return state, covariance, and an array of shape (3, S, components): innovation, its variance for
+    one sample, and 1 if fused; NaN without a sample.
 
     Parameters
     ----------
     sample_mean : EventSamples
         Mean of one event.
     R, gate : ndarray, shape (S,)
-        Variance of one sample, and innovation gate (√ of the innovation variance).
+        Variance of one sample, and gate in √S.
     rows : slice
-        Indices of the vector in the state (NED) that the sensor measures in the body frame.
+        State (NED vector) that the sensor measures in the body frame.
     bias_rows : slice, optional
-        Indices of a sensor bias in the state (body frame) that adds to the measurement.
+        State (body frame) that is added to the measurement.
     """
     state = x[:, rows]
     sample_count = sample_mean.sample_count

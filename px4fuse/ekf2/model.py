@@ -1,13 +1,11 @@
 """Replay of EKF2 from a default log, with the logged and with other parameters.
 
-The model contains the part of EKF2 that horizontal positions affect: 15 error states about the
-published attitude. It starts from the logged ``estimator_states``. Inputs are the logged IMU and
-positions; in a flight with GNSS also velocities and, if logged, the magnetometer (21 states). Other
-measurements (height; heading without the magnetometer) are replaced by EKF2's published values.
-:mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
+The model has 15 error states about the published attitude and starts from the logged
+``estimator_states``. Inputs are the logged IMU and positions; in a flight with GNSS also velocities
+and, if logged, the magnetometer (21 states). Other measurements are replaced by EKF2's published
+height and heading. :mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
 
-A filter configuration consists of parameters, estimated states, fused aiding sources and gate. All
-filter configurations run together, to save time.
+All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,7 +33,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_samp
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    MANY_REJECTIONS_SHARE,
+    MANY_REJECTIONS_FRACTION,
     UPDATE_COLUMNS,
     VELOCITY_UPDATE_COLUMNS,
     Agreement,
@@ -72,7 +70,7 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
-# Fields of Agreement with another name than the aiding source, by PX4's name of the source
+# Field of Agreement for an aiding source, if it is not PX4's name of the source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
@@ -84,17 +82,12 @@ class Model:
 
     Attributes
     ----------
-    flight : Flight
-    inputs : Inputs
     intervals : mapping from Timing to tuple of Intervals
-        Intervals between fusion events of each segment, by delay; empty if not yet computed.
+        Intervals of each segment that were already computed.
     flown : Ekf2Replay
-        Replay with the logged parameters.
-    agreement : Agreement
-        Agreement of ``flown`` with the log.
+        Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
-        One run per segment, with the filter configurations already computed: logged parameters,
-        logged parameters with logged rejections, and the result of ``request_configurations``.
+        Results of the filter configurations that were already run, per segment.
     """
 
     flight: Flight
@@ -110,16 +103,8 @@ def open_model(
 ) -> Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
-    Parameters
-    ----------
-    flight : Flight
-    request_configurations : callable
-        Function that returns the filter configurations that are needed later. Running all
-        configurations together saves time.
-
-    Returns
-    -------
-    Model, or Unavailable with the reason why the flight cannot be replayed.
+    ``request_configurations`` returns further filter configurations that will be needed. Running
+    all together saves time.
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
@@ -138,10 +123,10 @@ def _open_without_aids(
     request_configurations: RequestConfigurations,
     failed_agreements: Mapping[str, Agreement],
 ) -> Model | Unavailable:
-    """Prepare the EKF2 replay without the aiding sources in ``failed_agreements``.
+    """Prepare the replay without some aiding sources.
 
-    Keys are PX4's names of the sources; values are the agreements of the replay that contained the
-    source and was wrong.
+    ``failed_agreements`` contains, by PX4's name of the source, the bad agreement of a replay with
+    it.
     """
     doubtful_aids = {
         name: agreement.doubtful[name] for name, agreement in failed_agreements.items()
@@ -166,7 +151,7 @@ def _open_without_aids(
     if isinstance(agreement, Unavailable):
         return agreement
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
+    if rejected_share > MANY_REJECTIONS_FRACTION and np.isfinite(inputs.received.rejected).any():
         agreement_with_decisions = agreement_with_log(
             flight, _make_replay(inputs, runs, configurations[1], {})
         )
@@ -185,7 +170,7 @@ def _open_without_aids(
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
-    """Replay EKF2 with logged parameters, and logged rejections and resets instead of the gate."""
+    """Replay EKF2 with logged parameters, rejections and resets."""
     configuration = FilterConfiguration(model.inputs.settings, uses_logged_decisions=True)
     return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
@@ -230,7 +215,7 @@ def replay_settings(
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         unused_parameters["EKF2_DELAY_MAX"] = (
-            f"in {firmware} the fusion horizon follows from the largest delay parameter"
+            f"in {firmware} the largest delay parameter is the delay of the fusion horizon"
         )
     if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
@@ -299,10 +284,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
-    """Return the model with noise added to every position that EKF2 received.
-
-    ``sigma_m`` is the standard deviation of the noise (m) along each axis.
-    """
+    """Return the model with noise of standard deviation ``sigma_m`` (m) added to every position."""
     inputs = model.inputs
     rng = np.random.default_rng(seed)
     new_inputs: dict[str, Any] = {}
@@ -315,10 +297,7 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
-    """Return the model with every received position rotated, and its timestamp delayed.
-
-    ``rotation_deg`` is clockwise seen from above.
-    """
+    """Return the model with positions rotated (clockwise from above) and timestamps delayed."""
     if not rotation_deg and not delay_s:
         return model
     received = model.inputs.received
@@ -340,8 +319,7 @@ def delayed_tracks(
 ) -> Iterator[pd.DataFrame]:
     """Yield position and velocity of each filter configuration at the fusion horizon.
 
-    The tracks are computed one at a time and without the output predictor, to limit memory and
-    time.
+    One track at a time limits memory.
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
@@ -351,7 +329,6 @@ def delayed_tracks(
 
 
 def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
-    """Run filter configurations, or return the stored runs of the model if these contain all."""
     if model.runs and all(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
@@ -364,10 +341,7 @@ def run_configurations(
     configurations: Sequence[FilterConfiguration],
     computed_intervals: Mapping[Timing, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through every segment.
-
-    ``computed_intervals`` contains intervals between fusion events that need no new computation.
-    """
+    """Run filter configurations through every segment; ``computed_intervals`` are reused."""
     timings = [configuration.timing(inputs) for configuration in configurations]
     runs = []
     for segment_index, segment in enumerate(inputs.segments):
@@ -383,7 +357,6 @@ def run_configurations(
 
 
 def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
-    """Return position and velocity of a state as a table with one row per prediction step."""
     index = pd.Index(run.segment.time_s, name="time_s")
     position = state[:, POSITION] / run.segment.metres
     return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
@@ -419,7 +392,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the spans (s) without a fused position that are longer than RESTART_GAP_S."""
+    """Return the spans (s) longer than RESTART_GAP_S without a fused position."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     ends = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
@@ -428,10 +401,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
 def _other_aid_updates(
     runs: Sequence[SegmentRun], configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with height sensors and with vision that is fused in addition to GNSS.
-
-    Keys are PX4's names of the aiding sources.
-    """
+    """Return the updates with heights, and with vision in addition to GNSS, by PX4's name."""
     updates_by_aid: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
         end_s = run.segment.time_s[run.events[configuration_index].end_step]
@@ -459,7 +429,7 @@ def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame
     variance_after = run.variance[rows + 1, configuration_index]
     fused_at_s = run.segment.time_s[events.end_step[rows], None]
     settings = run.configurations[configuration_index].settings
-    # a clipped innovation was fused: it is at the gate limit, except for rounding
+    # innovations exactly at the gate were clipped and fused; the factor covers rounding
     limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
     velocity_rejected = (nu[:, :3] ** 2 > limit * S[:, :3]).any(axis=1, keepdims=True)
     # position along north and east (m), then velocity along north, east and down (m/s)
@@ -495,13 +465,9 @@ def _delayed_and_published(
 
 
 def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
-    """Return the state of one filter configuration at each prediction step.
+    """Return the state and the sum of position resets (m) at each of n prediction steps.
 
-    Returns
-    -------
-    state : ndarray, shape (n + 1, 15)
-    reset_m : ndarray, shape (n + 1, 3)
-        Sum of position resets until each step.
+    Shapes (n + 1, 15) and (n + 1, 3).
     """
     event_steps = run.events[configuration_index].end_step
     configuration = run.configurations[configuration_index]

@@ -1,10 +1,9 @@
 """Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
 The output predictor propagates the delayed state to the present with the IMU. In each prediction
-step it compares the buffered output at the fusion horizon with the state. Velocity and position of
-the whole buffer are corrected by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
-recursion is linear with constant coefficients, so it is computed as a recursive (IIR) filter for a
-whole segment.
+step it compares its buffered output with the state at the fusion horizon, and corrects velocity and
+position by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This is a linear recursion,
+computed as a recursive (IIR) filter.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -38,13 +37,13 @@ def publish(
     lag: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
-    """Return the published velocity and position at the end of each prediction step.
+    """Return the published velocity (m/s) and position (m) after each of n prediction steps.
 
     Parameters
     ----------
     segment : ReplaySegment
     state : ndarray, shape (n + 1, 15) or more
-        State at the fusion horizon; each row is at the time to which the state refers.
+        State at the fusion horizon.
     reset_m : ndarray, shape (n + 1, 3)
         Sum of position resets up to each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
@@ -52,12 +51,7 @@ def publish(
     lag : int
         Number of steps between fusion horizon and present.
     settings : mapping
-        Parameters by PX4 name, among them EKF2_TAU_VEL and EKF2_TAU_POS.
-
-    Returns
-    -------
-    velocity_m_s, position_m : ndarray, shape (n + 1, 3)
-        Published state. Before step ``lag`` it is dead reckoning from the first state.
+        EKF2 parameters by PX4 name.
     """
     step_s = segment.step_s[:, None]
     mean_step = float(np.mean(segment.step_s))
@@ -86,10 +80,10 @@ def publish(
 
 
 def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
-    """Return the sum c of all corrections with which the output follows the state.
+    """Return the sum of all corrections, with which the output follows the state.
 
-    ``offset`` is the state minus the output without corrections. In step k, with gain g and error
-    e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    ``offset`` o is the state minus the output without corrections. With gain g and error e_k =
+    o_(k-lag) - c_k, the sum of corrections is c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_GAIN * g**2
@@ -101,24 +95,15 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
 
 
 def delay_by(values: Array, lag: int) -> Array:
-    """Delay values by ``lag`` prediction steps; the first value is repeated ``lag`` times."""
+    """Delay values by ``lag`` steps; the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
-    """Return the correction with which the published attitude follows the filter's attitude error.
+    """Return the sum of the attitude corrections of the output predictor.
 
-    Each prediction step corrects the newest attitude by the fraction 0.5 · step / horizon of the
-    attitude error at the fusion horizon.
-
-    Parameters
-    ----------
-    error_rad : ndarray, shape (n + 1, 3)
-        Attitude error at the fusion horizon (rotation vectors); each row is at the time to which
-        the error refers.
-    lag : int
-        Number of steps between fusion horizon and present.
-    step_s, horizon_s : float
+    Each step corrects the attitude by 0.5 · step / horizon of ``error_rad``, the attitude error at
+    the fusion horizon (rotation vectors, shape (n + 1, 3)).
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag + 2))

@@ -64,31 +64,28 @@ VELOCITY_UPDATE_COLUMNS = [
 # Minimum number of logged innovations for a comparison with the replay
 MIN_SAMPLES = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
-# Maximum time (s) from an update to its logged innovation: estimator_innovations repeats a sample
-# with later timestamps until the next fusion
+# Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
-# Maximum time (s) between fusion and publication for treating both as the same prediction step
+# Times with a smaller difference (s) are in the same prediction step
 SAME_STEP_S = 0.002
-# Minimum correlation of replayed and logged innovations: above 0.997 in simulated flights with
-# complete logs, below 0.9 with a downsampled source or IMU dropouts (see
-# tests/benchmarks/bench_ekf2.py)
+# Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
+# with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
 MIN_CORRELATION = 0.95
-# Maximum deviation from 1 of the median ratio of replayed to logged innovation variance S: below
-# 0.003 in simulated flights with complete logs; above 0.05 with a downsampled source
+# Maximum |S replayed / S logged - 1| (median): below 0.003 with complete logs, above 0.05 with a
+# downsampled source
 MAX_S_DIFFERENCE = 0.05
-# Maximum RMS difference (m) of replayed and logged published position: below 0.013 m with complete
-# logs
+# Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# Maximum difference (m) of the published position while optical flow is the only horizontal aiding
-# source: larger, because optical flow is logged at a reduced rate
+# Maximum position difference (m) while optical flow, which is logged at a reduced rate, is the only
+# horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Maximum rejected fraction for comparing single innovations. With more rejections, one sample near
-# the gate limit changes many later samples: then only rejected fraction and mean NIS are compared,
-# and single innovations in a second replay with the logged rejections
-MANY_REJECTIONS_SHARE = 0.05
+# With a larger rejected fraction, only rejected fraction and mean NIS are compared, because one
+# sample near the gate changes many later ones. Single innovations are then compared in a replay
+# with the logged rejections
+MANY_REJECTIONS_FRACTION = 0.05
 # Rejected fraction above which EKF2's position is mostly integrated from the IMU: the published
 # position is then not tested, but the innovations must agree better
-MOSTLY_REJECTED_SHARE = 0.5
+MOSTLY_REJECTED_FRACTION = 0.5
 MIN_IMU_CORRELATION = 0.99
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
@@ -106,12 +103,11 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
     innovation_correlation : float
         Correlation of replayed and logged innovations.
     innovation_rms_difference : float
-        RMS of replayed minus logged innovations, in their unit (m for positions).
+        RMS of replayed minus logged innovations, in their unit.
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
-        Replayed over logged innovation variance: median, and 5 and 95 % quantiles.
-    nis_mean_logged, nis_mean_replayed : float
+        Replayed ÷ logged innovation variance: median, 5 and 95 % quantiles.
     position_rms_difference_m, velocity_rms_difference_m_s : float
-        RMS of the difference of the published state, replay minus log.
+        RMS of the difference of the published state.
     """
 
     innovation_correlation: Correlation
@@ -131,34 +127,24 @@ class Agreement(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     north, east : AxisAgreement
-        Agreement of the position innovations: of GNSS or, without GNSS, of external vision.
-    ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        Agreement of external vision (also in addition to GNSS), and of GNSS positions.
-    gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
-        Agreement of the GNSS velocity; "down" only if GNSS height is also fused.
-    gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
-        Agreement of heights, if the log contains all fused samples.
+        Position innovations of GNSS or, without GNSS, of external vision.
+    ev_pos, gnss_pos, gnss_vel, gnss_hgt, baro_hgt : mapping from axis to AxisAgreement
+        Innovations of each aiding source, by PX4's name.
     samples : int
-        Number of compared logged innovations, without the first seconds of each segment
-        (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
-    rejected_fraction_logged, rejected_fraction_replayed : float
-        Fraction of the compared samples that EKF2 rejected, and that the replay rejected.
+        Number of compared innovations, without the first seconds of each segment.
     decisions_same : float
-        Fraction of the compared samples that EKF2 and replay both rejected or both accepted.
+        Fraction of the samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
-        RMS of the difference of the published horizontal position, replay minus log.
+        RMS difference of the published horizontal position.
     heading_rms_difference_deg : float or None
-        RMS of the heading difference, replay minus log; None if the replay uses the logged heading.
+        None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Largest horizontal position difference while optical flow was the only horizontal aiding
-        source; the other numbers exclude these times. None without such times.
+        Largest position difference while optical flow was the only horizontal aiding source.
     doubtful : mapping from PX4's name of an aiding source to str
-        Aiding sources with a replay that does not agree with the log, and the reasons. The replay
-        omits them, see :func:`~px4fuse.ekf2.inputs.prepare_inputs`.
+        Sources that the replay omits, because it does not agree with the log, and the reasons.
     good : bool
-        True if the replay agrees with the log.
     reason : str
-        Sentence with the numbers on which ``good`` is based.
+        Numbers on which ``good`` is based.
     """
 
     north: AxisAgreement
@@ -185,7 +171,6 @@ class Agreement(Record, frozen=True, kw_only=True):
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, result_name: str) -> Unavailable:
-        """Return Unavailable for a result of a replay that does not agree with the log."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
             result_name,
@@ -202,33 +187,19 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     source : str
         Position track that was fused.
     stretches_s : tuple of (float, float)
-        Replayed segments of the flight, each started from the logged state.
+        Replayed segments of the flight.
     settings : mapping
-        All parameters of the model, by PX4 name, in PX4's units.
+        All parameters of the model, by PX4 name.
     late, lost : int
-        Number of samples that arrived after the fusion horizon had passed their measurement time:
-        fused late, and never fused.
-    agreement : Agreement or None
-        Agreement of the replay with logged parameters; None while the agreement is computed.
-    changed : mapping
-        Values of the parameters that differ from the log, by PX4 name.
-    updates : DataFrame, shape (m, 14), or (m, 21) with velocity
-        One row per position sample, at EKF2's measurement time (timestamp - delay - half a step).
+        Number of samples that were fused late, and that were too late to be fused.
+    updates : DataFrame, one row per position sample, at EKF2's measurement time
         Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
-        Variances of position and velocity are after the update. ``fused_at_s`` is the end of the
-        prediction step. Innovations are measurement minus state.
-    other_aid_updates : mapping from PX4's name to DataFrame, shape (k, 5), or (k, 8) for vision
-        One row per sample of GNSS height, barometer, and vision that is fused in addition to GNSS:
-        innovation and S (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``,
-        ``fused`` and ``fused_at_s``. Vision has innovations north and east, and ``reset``. A sample
-        with which only the bias of vision was reset has no row.
+    other_aid_updates : mapping from PX4's name to DataFrame
+        Updates with GNSS height, barometer, and vision in addition to GNSS.
     flow_only_spans_s : tuple of (float, float)
-        Times between positions in which optical flow was the only horizontal aiding source.
-    delayed : DataFrame, shape (n, 7)
-        Position and velocity (m, m/s, NED) and ``heading_rad`` of the state at the fusion horizon,
-        at the end of each prediction step.
-    published : DataFrame, shape (n, 6)
-        Position and velocity that the output predictor publishes, at the times of ``delayed``.
+        Times in which optical flow was the only horizontal aiding source.
+    delayed, published : DataFrame
+        State (NED) at the fusion horizon, and as published, after each prediction step.
     """
 
     source: str
@@ -327,10 +298,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest horizontal position difference (m) between replay and log with flow only.
-
-    None if optical flow was never the only horizontal aiding source.
-    """
+    """Return the largest horizontal position difference (m) with flow only; None without it."""
     times = ekf2.state.index[inside_spans(ekf2.state.index, replay.flow_only_spans_s)].to_numpy()
     if not len(times):
         return None
@@ -343,7 +311,6 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the RMS heading difference (°) between replay and log; None without magnetometer."""
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged_state = ekf2.record.delayed
@@ -359,7 +326,6 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 def _has_constant_innovations(
     logged_samples: pd.DataFrame, model_samples: pd.DataFrame, axes: Iterable[AxisName]
 ) -> bool:
-    """Return True if logged or replayed innovations are constant: they have no correlation."""
     columns = [f"innovation_{axis}_m" for axis in axes]
     return not all(
         np.ptp(innovations[columns], axis=0).all()
@@ -370,7 +336,7 @@ def _has_constant_innovations(
 def _velocity_agreement(
     ekf2: Ekf2, replay: Ekf2Replay, *, is_own_topic: bool
 ) -> tuple[dict[str, AxisAgreement], bool]:
-    """Return the agreement of GNSS velocity, and True if its innovations are constant.
+    """Return the agreement of GNSS velocity, and True if innovations are constant.
 
     The agreement is empty if velocity is not fused or not logged.
     """
@@ -400,10 +366,7 @@ def _velocity_agreement(
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of height sensors and of vision in addition to GNSS, by PX4 name.
-
-    Return also the reason of each disagreement, by PX4 name.
-    """
+    """Return the agreement of heights and of vision in addition to GNSS, and each disagreement."""
     agreements: dict[str, dict[str, AxisAgreement]] = {}
     doubtful_aids = {}
     for name, updates in replay.other_aid_updates.items():
@@ -441,14 +404,13 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
 
 
 def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
-    """Return logged innovations, S and rejections of the aiding source with PX4's name ``name``."""
+    """Return logged innovations, S and rejections of an aiding source (PX4's name)."""
     gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in log.axes]
     return _columns_by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
 
 
 def axes_of(updates: pd.DataFrame) -> list[AxisName]:
-    """Return the axes for which ``updates`` has position innovations."""
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
@@ -491,8 +453,7 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
 def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
-    ``is_own_topic`` is True if the innovations are from an estimator_aid_src topic, which contains
-    measurement times.
+    ``is_own_topic`` is True for estimator_aid_src topics, which contain measurement times.
     """
     if is_own_topic:
         return same_sample(updates.index.to_numpy(), times)
@@ -535,7 +496,7 @@ def _axis_agreement(
 
 
 def along(vectors: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
-    """Interpolate the component of a vector (NED columns of ``vectors``) along a direction."""
+    """Interpolate the component of a vector (NED columns) along a direction."""
     component = signals.weighted_sum(vectors, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, vectors.index, component))
 
@@ -555,7 +516,6 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -565,11 +525,7 @@ def _agreement_verdict(
     rejected_in_replay: float,
     published_factor: float = 1.0,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the reason with numbers.
-
-    ``rejected_in_log`` and ``rejected_in_replay`` are fractions of the samples;
-    ``published_factor`` multiplies MAX_PUBLISHED_DIFFERENCE_M.
-    """
+    """Return True if the replay agrees with the log, and the reason with numbers."""
     s_ratios = (axis.s_ratio_median for axis in axes.values())
     ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(ratio - 1.0) > MAX_S_DIFFERENCE:
@@ -578,7 +534,9 @@ def _agreement_verdict(
             f"{MAX_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
-    correlation_text = f"the correlation {min_correlation:.4f} of replayed and logged innovations"
+    correlation_text = (
+        f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
+    )
     if min_correlation >= MIN_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
         limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
@@ -588,40 +546,38 @@ def _agreement_verdict(
                 f"{_format_beyond(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
-        return True, f"{correlation_text} is sufficient"
-    if max(rejected_in_log, rejected_in_replay) < MANY_REJECTIONS_SHARE:
-        return False, f"{correlation_text} is below the minimum of {MIN_CORRELATION:g}"
+        return True, f"{correlation_text}"
+    if max(rejected_in_log, rejected_in_replay) < MANY_REJECTIONS_FRACTION:
+        return False, f"{correlation_text}, below the minimum of {MIN_CORRELATION:g}"
     rejected_difference = abs(rejected_in_replay - rejected_in_log)
     nis = max(abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values())
     text = (
-        f"the replay rejected {rejected_in_replay:.1%} of the samples (log "
-        f"{rejected_in_log:.1%}), and its mean NIS differs by {nis:.0%}"
+        f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
+        f"the mean NIS differs by {nis:.0%}"
     )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis > MAX_NIS_DIFFERENCE:
         return False, (
             f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
-    return True, f"{text}; single innovations differ, because a rejection changes later innovations"
+    return (
+        True,
+        f"{text}; single innovations are not compared, because rejections change later ones",
+    )
 
 
 def _format_beyond(value: float, limit: float) -> str:
-    """Format a value with two decimals, or with more if it would not be above ``limit``."""
+    """Format a value with at least two decimals, so that it is visibly above the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> Agreement:
     """Return the agreement of a replay with EKF2's logged decisions.
 
-    With many rejections one sample near the gate limit makes the replay differ from the log,
-    although the filter equations are the same.
-
-    Parameters
-    ----------
-    agreement, with_decisions : Agreement
-        Agreement of the replay with the model's gate, and of the replay with logged decisions.
+    With many rejections, one sample near the gate makes a correct replay differ from the log.
+    ``agreement`` is of the replay with the gate of the model.
     """
     rejected = agreement.rejected_fraction_logged
-    relies_on_imu = rejected > MOSTLY_REJECTED_SHARE
+    relies_on_imu = rejected > MOSTLY_REJECTED_FRACTION
     published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
     is_good, reason = _agreement_verdict(with_decisions.axes, 0.0, 0.0, published_factor)
     correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
@@ -631,7 +587,7 @@ def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> A
             f"the correlation {correlation:.4f} of replayed and logged innovations is below the "
             f"minimum of {MIN_IMU_CORRELATION:g}"
         )
-    reason = f"with EKF2's logged rejections: {reason}"
+    reason = f"in a replay with EKF2's logged rejections, {reason}"
     if relies_on_imu and not is_good:
         reason += (
             f". EKF2 rejected {rejected:.0%} of the positions and relied on the IMU. The frame of "

@@ -1,4 +1,4 @@
-"""Segments of a flight for the EKF2 replay, without gaps: prediction steps and initial state.
+"""Segments of a flight without gaps for the EKF2 replay: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -30,24 +30,21 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# Maximum gap (s) in the position source within a segment. After a longer gap the replay restarts
-# from the logged state: in the gap EKF2 fuses gravity, fake positions or zero velocity, which the
-# model does not contain
+# After a longer gap (s) in the position source, the replay restarts from the logged state, because
+# the model lacks the gravity, fake positions or zero velocity that EKF2 fuses in the gap
 RESTART_GAP_S = 2.0
-# Maximum IMU interval (s): PX4 limits a prediction step to 2 EKF2_PREDICT_US, so EKF2 loses the
-# motion in a longer gap
+# Maximum IMU interval (s): EKF2 limits a prediction step to 2 EKF2_PREDICT_US
 IMU_GAP_S = 0.05
 # Minimum time (s) from EKF2's first position fusion to the start of the replay
 MIN_FUSION_S = 1.0
-# Minimum time (s) from take-off to the start of the replay: on the ground EKF2 fuses zero velocity
-# and gravity, and only motion in the air distinguishes tilt from accelerometer bias
+# Minimum time (s) from take-off to the start of the replay: on the ground EKF2 also fuses zero
+# velocity and gravity
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from the first logged fusion of all magnetometer axes until the log contains the magnetic
-# field states that EKF2 resets after take-off
+# Time (s) from the first fusion of all magnetometer axes until the reset field states are logged
 FIELD_RESET_S = 1.0
-# Flight time (s) before the replay that is used to estimate correlations of the initial state
+# Flight time (s) before the replay from which the correlations of the initial state are estimated
 CORRELATION_HISTORY_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15)
 MAG_FUSION_HZ = 14.0
@@ -57,13 +54,12 @@ MIN_MAG_LOG_HZ = 1.5
 INNOVATION_FILTER_S = 0.5
 # Minimum length (s) of a replayed segment
 MIN_SEGMENT_S = 10.0
-# Maximum delay (s) from a reset to its publication: largest delay of the fusion horizon plus one
-# logging interval
+# Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# Maximum fraction of clipped IMU samples within 1 s: with more, the replay is interrupted
-MAX_CLIPPED_SHARE = 0.05
-# Maximum fraction of single IMU samples missing in the log, up to which the replay ignores them
-MAX_LOST_IMU_SHARE = 0.02
+# The replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
+MAX_CLIPPED_FRACTION = 0.05
+# A smaller fraction of missing IMU samples is ignored
+MAX_LOST_IMU_FRACTION = 0.02
 
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])
@@ -81,25 +77,21 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment: m means, each over successive samples.
-
-    k is the number of measured components: 3 for a magnetometer, 2 for optical flow.
+    """Magnetometer or optical flow data of one segment: means of successive samples.
 
     Attributes
     ----------
     step : ndarray of int, shape (m,)
-        Prediction step after which EKF2 fuses the last sample of each mean.
+        Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Magnetometer: field (gauss, body FRD). Optical flow: velocity forward and right (m/s)
-        minus the velocity change that the IMU measured since the start of the segment.
+        Field (gauss, FRD; k = 3), or velocity forward and right minus the IMU's velocity (m/s).
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
-        Number of samples that EKF2 received, for each mean.
     noise : ndarray, shape (m,)
-        Variance R of one sample; 0 if R is a parameter of the replay.
+        R of one sample; 0 if R is a parameter.
     gate : float
-        Innovation gate in √S; infinite if the gate is a parameter of the replay.
+        Innovation gate in √S; infinite if the gate is a parameter.
     """
 
     step: IntArray
@@ -117,18 +109,15 @@ class HeightSamples:
     Attributes
     ----------
     fused : tuple of str
-        PX4's names of the height sensors: barometer, GNSS, or both.
+        PX4's names of the fused height sensors.
     reference : str
-        PX4's name of the reference sensor, which has no bias.
+        Sensor without a bias.
     bias : (float, float)
-        Initial bias of the other sensor (m, positive: too high), and variance of the bias (m²).
-    step : ndarray of int, shape (m,)
-        Prediction step after which EKF2 fuses each barometer sample.
-    measured_at_s, down_m : ndarray, shape (m,)
-        EKF2's measurement time, and height (positive down) of each barometer sample.
+        Initial bias of the other sensor (m, positive: too high), and its variance (m²).
+    step, measured_at_s, down_m : ndarray, shape (m,)
+        Prediction step, measurement time, and height (m, down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
-        Dead zone: in ground effect, EKF2 ignores a height that is below the state by up to this
-        distance.
+        EKF2 ignores heights below the state by less than this distance (ground effect).
     weight : ndarray, shape (m,)
         Number of barometer samples that EKF2 fused per known sample.
     """
@@ -147,62 +136,43 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, replayed in one run of n prediction steps.
 
-    The nominal attitude is EKF2's published attitude. The model estimates the error of the nominal
-    attitude, so the equations are linear. Vectors are in NED unless noted.
+    The model estimates the error of the nominal attitude, EKF2's published attitude. Vectors are in
+    NED unless noted.
 
     Attributes
     ----------
     time_s : ndarray, shape (n + 1,)
-        Time of the start, then of the end of each step.
-    step_s : ndarray, shape (n,)
+        Start, then end of each step.
     body_to_ned : ndarray, shape (n + 1, 3, 3)
-        Rotation matrices of the nominal attitude, body FRD to NED.
+        Nominal attitude.
     correction_rad : ndarray, shape (n, 3)
-        Rotation of the nominal attitude in each step minus the rotation measured by the gyro, plus
-        the rotation of the earth.
+        Rotation of the nominal attitude in each step minus that of the gyro.
     force_m_s2 : ndarray, shape (n, 3)
-        Specific force in each step minus the nominal bias, in the body frame at the end of the
-        step.
+        Specific force minus nominal bias, in the body frame at the end of the step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal bias: logged bias at the start.
-    state : ndarray, shape (15,) or (21,)
-        Initial attitude error, velocity, position, errors of gyro and accelerometer bias, and with
-        21 states the magnetic fields of earth and body.
-    variance : ndarray, shape (15,) or (21,)
-        Initial variances of the states.
-    down_m : ndarray, shape (n + 1,)
-        Published height (positive down).
-    attitude_variance_rad2 : ndarray, shape (n + 1, 3)
-        Logged variance of the attitude.
-    down_variance_m2 : ndarray, shape (n + 1,)
-        Logged variance of the height.
-    attitude_error_rad : ndarray, shape (n + 1, 3)
-        Logged attitude at the fusion horizon minus the nominal attitude.
+        Nominal bias: logged at the start.
+    state, variance : ndarray, shape (15,) or (21,)
+        Initial attitude error, velocity, position, gyro and accelerometer bias errors, and fields.
+    down_m, down_variance_m2 : ndarray, shape (n + 1,)
+        Published height (positive down), and its variance.
+    attitude_error_rad, attitude_variance_rad2 : ndarray, shape (n + 1, 3)
+        Logged attitude minus nominal attitude, and its variance.
     correlation : ndarray, shape (15, 15) or (21, 21)
-        Correlations of the initial state; estimated, because the log contains variances only.
-    fusing : bool
-        True if EKF2 fuses the position source at the start.
-    field : SensorSamples or None
-        Magnetometer samples (with 21 states); None if the logged EKF2 heading is used.
+        Estimated correlations of the initial state.
+    field, flow : SensorSamples or None
     heights : HeightSamples or None
-        Height samples; None if the height of EKF2 or of external vision is used.
-    clipped_share : ndarray, shape (n + 1,), or None
-        Fraction of clipped accelerometer axes in the step until each time, which have a larger
-        noise. None with external vision only.
+    clipped_fraction : ndarray, shape (n + 1,), or None
+        Fraction of the accelerometer axes that are clipped in the step.
     is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
-        True while EKF2 reports a bad vertical acceleration. None if not logged, or with external
-        vision only.
+        Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
-        Mean vertical accelerometer bias minus nominal bias, from the acceleration and the change of
-        the published velocity.
-    flow : SensorSamples or None
-        Optical flow samples, if EKF2 fused optical flow.
+        Mean vertical accelerometer bias, from the published velocity.
     metres : (float, float, float)
-        Ratio of EKF2's internal metres to published metres: north, east and down.
+        EKF2's internal metres per published metre.
     history : ReplaySegment or None
-        Flight before the start, from which the initial correlations are estimated.
+        Flight before the start, from which the correlations are estimated.
     changed : mapping from PX4's name to float
-        Parameters that were changed in flight before the segment, with their values in it.
+        Parameters that were changed in flight.
     """
 
     time_s: Array
@@ -221,7 +191,7 @@ class ReplaySegment:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    clipped_share: Array | None = None
+    clipped_fraction: Array | None = None
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
@@ -231,17 +201,14 @@ class ReplaySegment:
 
     @cached_property
     def imu_velocity_m_s(self) -> Array:
-        """Velocity change since the start, integrated from the IMU (m/s, NED), shape (n + 1, 3)."""
+        """Velocity change since the start from the IMU (m/s, NED), shape (n + 1, 3)."""
         force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
         velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), velocity_increments])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement since the start (m, NED), integrated from the IMU with initial velocity 0.
-
-        Shape (n + 1, 3).
-        """
+        """Displacement since the start from the IMU (m, NED), shape (n + 1, 3)."""
         speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
@@ -255,9 +222,7 @@ def samples_by_event(
     axes: slice,
     *more: Array,
 ) -> Array:
-    """Sort position samples by the event (end of an interval) at which they are fused.
-
-    Each of E events has k slots; k is the largest number of samples between two events.
+    """Sort samples by the event at which they are fused: k slots for each of E events.
 
     Parameters
     ----------
@@ -265,19 +230,18 @@ def samples_by_event(
     event_steps : ndarray of int, shape (E,)
         Prediction step of each event.
     measurement_step : ndarray of int, shape (m,)
-        Prediction step after which each position was measured; increasing.
+        Prediction step of each sample, increasing.
     position_m : ndarray, shape (m, a)
-        Positions along a axes.
     axes : slice
-        Range of the a axes within north, east and down.
+        Axes of the position within NED.
     *more : ndarray, shape (m,)
-        Further quantities of each sample.
+        Further quantities.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(more), k, E)
-        Position plus the displacement up to the event due to the IMU acceleration; sample age (s)
-        at the event; ``more``; and 1 for a sample. All are 0 in empty slots.
+        Position moved to the event by the IMU acceleration, age (s), ``more``, and 1 for a sample;
+        0 in empty slots.
     """
     event = np.searchsorted(event_steps, measurement_step)
     event = event[event < len(event_steps)]
@@ -317,14 +281,12 @@ def find_replay_segments(
 ) -> tuple[ReplaySegment, ...]:
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
 
-    ``source_s`` are the timestamps of the position samples. With GNSS (``is_gnss``), magnetic
-    fields are states if the log contains the magnetometer samples, and a bad or clipped
-    acceleration has a larger noise.
+    ``source_s`` are the timestamps of the positions.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     fused_s = innovations.index.to_numpy()
-    states = record.delayed.index.to_numpy()
+    state_times_s = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
@@ -336,7 +298,7 @@ def find_replay_segments(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(record) if is_gnss else None
     cuts += field_span[1:] if field_span else ()
-    # end a segment when the primary EKF2 instance changes, because instances have different states
+    # another primary EKF2 instance has another state
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
     changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cuts += [change.time_s for change in changes]
@@ -350,10 +312,12 @@ def find_replay_segments(
         starts = [start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high]
         if field_span and low <= field_span[0] < high:
             starts.append(field_span[0])
-        start_row = int(np.searchsorted(states, max([fused_inside[0] + MIN_FUSION_S, *starts])))
-        if start_row == len(states) or high - states[start_row] < MIN_SEGMENT_S:
+        start_row = int(
+            np.searchsorted(state_times_s, max([fused_inside[0] + MIN_FUSION_S, *starts]))
+        )
+        if start_row == len(state_times_s) or high - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (time[1:] > states[start_row]) & (time[:-1] < high)
+        is_covered = (time[1:] > state_times_s[start_row]) & (time[:-1] < high)
         if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
         segment_inputs = imu, attitude, ekf2, record
@@ -361,12 +325,14 @@ def find_replay_segments(
         make_segment = _make_gnss_segment if is_gnss else _make_segment
         segment = make_segment(*segment_inputs, start_row, high)
         history_row = int(
-            np.searchsorted(states, max(first_s, states[start_row] - CORRELATION_HISTORY_S))
+            np.searchsorted(
+                state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
+            )
         )
         if history_row < start_row:
-            history = make_segment(*segment_inputs, history_row, states[start_row])
+            history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
-        if field_span and field_span[0] <= states[start_row] and high <= field_span[1]:
+        if field_span and field_span[0] <= state_times_s[start_row] and high <= field_span[1]:
             segment = _add_field(segment, record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed=changed))
     return tuple(segments)
@@ -380,7 +346,7 @@ def _make_gnss_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    """Make a segment with earth rotation, EKF2's internal metres and noise of bad accelerations."""
+    """Make a segment with earth rotation, EKF2's internal metres and bad accelerations."""
     segment = _make_segment(imu, attitude, ekf2, record, start_row, end_s)
     metres = ekf2_metres_per_metre(record)
     state = segment.state.copy()
@@ -394,17 +360,13 @@ def _make_gnss_segment(
         state=state,
         metres=metres,
         correction_rad=segment.correction_rad + earth_rotation_rad,
-        clipped_share=_clipped_share(imu, segment.time_s),
+        clipped_fraction=_clipped_fraction(imu, segment.time_s),
         mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
     )
 
 
 def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
-    """Return the times (s) at which the replay must be interrupted.
-
-    These are the start and end of clipping, which loses motion, and of each reset of height or
-    vertical velocity, which is published with a delay.
-    """
+    """Return the times (s) at which the replay must be interrupted: clipping and height resets."""
     breaks = [
         time
         for reset in ekf2.resets
@@ -416,21 +378,23 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         clipped_s = times[imu["clipped"].to_numpy() > 0.0]
         begin, end = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
         clipped_moments = clipped_s[
-            end - begin > MAX_CLIPPED_SHARE / float(np.median(np.diff(times)))
+            end - begin > MAX_CLIPPED_FRACTION / float(np.median(np.diff(times)))
         ]
         breaks += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return breaks
 
 
-def _clipped_share(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return the fraction of clipped accelerometer axes in the step until each time."""
-    share_by_step = np.zeros(len(time_s))
+def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
+    """Return the fraction of the accelerometer axes that are clipped in the step before a time."""
+    fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
-        clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
-        np.maximum.at(share_by_step, np.searchsorted(time_s, clipped.index), clipped_share)
-    return share_by_step
+        clipped_fraction = (
+            np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+        )
+        np.maximum.at(fraction_by_step, np.searchsorted(time_s, clipped.index), clipped_fraction)
+    return fraction_by_step
 
 
 def _make_segment(
@@ -470,7 +434,7 @@ def _make_segment(
         rotation = conjugate(interpolate(at_s, times, end_attitude))
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), rotation)
 
-    # rotation (NED) between the attitude integrated from the gyro and the published attitude
+    # published attitude relative to the integrated gyro, in NED
     extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)
@@ -478,7 +442,7 @@ def _make_segment(
     published_m = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
     position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published_m)
-    # from PX4 v1.16 on, state and published height have different origins
+    # from PX4 v1.16 on, the height of the state has another origin than the published height
     position[2] = published_m[2]
     return ReplaySegment(
         time_s=times,
@@ -524,7 +488,6 @@ def _field_span(record: FusionRecord) -> Span | None:
 def _add_field(
     segment: ReplaySegment, record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
-    """Add the logged magnetic fields to the states of a segment."""
     start = record.delayed.iloc[start_row]
     field_gauss = record.field_gauss
     stamps = field_gauss.index.to_numpy()
@@ -545,10 +508,9 @@ def _add_field(
 def _mean_field(
     segment: ReplaySegment, delayed_state: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Reconstruct the mean magnetic field between two logged rows from filtered innovations.
+    """Return the mean magnetic field between logged rows, from low-pass filtered innovations.
 
-    EKF2 logs the low-pass filtered difference of predicted and measured field (FRD, gauss), and the
-    states from which the field is predicted.
+    Field = field predicted from the logged states - innovation (FRD, gauss).
     """
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
@@ -580,19 +542,14 @@ def _mean_field(
 def low_pass_weights(
     segment: ReplaySegment, newest_s: Array, count: Array, interval_s: Array, share: Array | float
 ) -> tuple[IntArray, Array]:
-    """Return the prediction steps and weights of the samples in each low-pass filtered mean.
+    """Return prediction step and weight of each sample in low-pass filtered means, shape (m, k).
 
     Parameters
     ----------
     newest_s, count, interval_s : ndarray, shape (m,)
-        For each mean: time of the newest sample, number of samples, and interval between samples.
+        Time of the newest sample, number of samples, and sample interval of each mean.
     share : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
-
-    Returns
-    -------
-    step, weight : ndarray, shape (m, k)
-        Newest sample first; k is the largest number of samples in a mean.
     """
     # age of a sample, in sample intervals
     age = np.arange(int(count.max(initial=1.0)))
@@ -619,7 +576,7 @@ def add_field_states(
     weight : float
         Number of samples that EKF2 fused per logged sample.
     fields, variance : ndarray, shape (6,)
-        Magnetic fields of earth (NED) and body (FRD) at the start, and their variances.
+        Initial fields of earth (NED) and body (FRD), and their variances.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
     rotation_to_body = segment.body_to_ned[step].transpose(0, 2, 1)
@@ -643,7 +600,7 @@ def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray
 
 
 def predict_s(record: FusionRecord) -> float:
-    """Return EKF2's configured prediction interval EKF2_PREDICT_US (s)."""
+    """Return EKF2_PREDICT_US in seconds."""
     return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
@@ -654,27 +611,13 @@ def _interpolate(series: pd.Series, times: Array) -> Array:
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
-    A step ends after :func:`samples_per_step` IMU samples, or when it is longer than the target.
-    The count of samples restarts at each logged end.
-
-    Parameters
-    ----------
-    interval_s : ndarray, shape (n,)
-        IMU intervals after the start.
-    logged_ends : ndarray of int
-        Logged ends of steps, increasing; may include the start.
-    target_s : float
-        Configured prediction interval, EKF2_PREDICT_US.
-
-    Returns
-    -------
-    ndarray of int
-        Ends of steps; the last end is at most n.
+    A step ends after :func:`samples_per_step` IMU samples, after EKF2_PREDICT_US (``target_s``), or
+    at a logged end, at which the count restarts.
     """
     median_s = float(np.median(interval_s))
     # number of samples in each interval; a single gap may be a gap of the IMU itself
     sample_counts = np.maximum(np.rint(interval_s / median_s), 1.0)
-    if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_SHARE:
+    if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
     end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
     samples_needed = samples_per_step(target_s, median_s, end_counts)

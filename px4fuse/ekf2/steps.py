@@ -1,15 +1,11 @@
-"""Sequence of filters that changes KF into EKF2, one property at a time, to explain KF - EKF2.
+"""Explanation of the difference KF - EKF2: replace KF by EKF2, one property at a time.
 
-Each filter of the sequence is a replay of the whole flight with one more property of EKF2. Each
-replacement of a property is called a step. The order is fixed: sample times, noises, estimated
-states, gate, and output predictor. The mean square difference from the logged EKF2 changes with
-each step. The changes of all steps and the remainder after the last step add up to the mean square
-difference KF - EKF2. The first step keeps the filter equations of KF, but uses the samples and
-prediction steps of EKF2.
+The flight is replayed with KF, then with one more property of EKF2 each time: sample times, noises,
+estimated states, gate, and output predictor. Each replacement is called a step. It reduces or
+increases the mean square difference from the logged EKF2.
 
-Biases precede process noise, because without bias states EKF2's small process noise would increase
-the error. The last replays use the logged rejections, because with many rejections one sample near
-the gate limit would change all later samples.
+Bias states precede process noise, because without them EKF2's small process noise would increase
+the error. The last replays use EKF2's logged rejections.
 """
 
 import math
@@ -38,9 +34,7 @@ OTHER_TIME = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Names of the properties that differ between KF and EKF2. "process noise" is the increase of the
-# velocity variance per second: SIGMA_A² · DT in KF, and EKF2_ACC_NOISE² · Δt in EKF2 with the
-# prediction step Δt
+# Names of the properties that differ between KF and EKF2
 SAMPLES = "samples and time steps"
 TIMESTAMPS = "timestamps and delay"
 NOISE = "measurement noise"
@@ -51,31 +45,27 @@ FIELD_STEP = "magnetometer"
 VELOCITY_STEP = "GNSS velocity"
 FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
-GATE = "gate, missed samples and resets"
+GATE = "rejections and resets"
 OUTPUT = "output predictor"
-# Order in which EKF2 properties replace KF properties. If EKF2 fuses more aiding sources in a
-# flight, each of them is an additional property, before GATE
+# Order of the replacements; further aiding sources of EKF2 precede GATE
 STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
-    """Change of the difference KF - EKF2 by replacing one KF property by the EKF2 property.
+    """Replacement of one property of KF by that of EKF2, and its effect.
 
     Attributes
     ----------
     name : str
-        Name of the property: one of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`,
-        :data:`FLOW_STEP` or :data:`VISION_STEP`.
+        Name of the property.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Reduction of the mean square difference from the logged EKF2; negative for an increase.
-    position_moved_m : float
-        Largest change of the position by the replacement.
-    moved_at_s : float
-        Time of the largest change.
+    position_moved_m, moved_at_s : float
+        Largest change of the position, and its time.
     position_rmse_to_truth_m : float or None
-        Position RMSE against ground truth after the replacement; None without ground truth.
+        Position RMSE after the replacement.
     """
 
     name: str
@@ -91,10 +81,6 @@ class RejectionRun(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    start_s : float
-        Time of the first rejected sample.
-    samples : int
-        Number of rejected samples.
     duration_s : float
         Time until a sample was fused again.
     distance_m : float
@@ -108,51 +94,34 @@ class RejectionRun(Record, frozen=True, kw_only=True):
 
 
 class UnreplayedDifference(Record, frozen=True):
-    """Largest position difference KF - EKF2 at times without replay: EKF2 starts or does not fuse.
-
-    Attributes
-    ----------
-    maximum_m : float
-        Absolute value of the largest difference.
-    at_s : float
-        Time of the largest difference.
-    """
+    """Largest position difference KF - EKF2 at times that the replay does not cover."""
 
     maximum_m: NotNegative
     at_s: float
 
 
 class DifferenceExplanation(Record, frozen=True, kw_only=True):
-    """Mean square difference KF - EKF2 along one axis, explained by differences of the filters.
+    """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    The mean square is the sum of the contributions of ``steps`` and a remainder.
+    The mean square is the sum of the reductions by all ``steps`` and of the unexplained remainder.
 
     Attributes
     ----------
     count : int
-        Number of EKF2 samples over which means are taken.
+        Number of EKF2 samples.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference between KF and the logged EKF2.
-    steps : tuple of Step
-        Replacements of KF properties by EKF2 properties, one after the other.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Remainder: mean square difference between the replay with all steps and the logged EKF2.
-    position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
-        Position RMSE against ground truth.
-    spans_s : tuple of (float, float)
-        Spans of the flight over which means are taken.
-    longest_rejection : RejectionRun or None
-        Longest run of rejections; None without rejections.
+        Mean square difference after all steps.
     outside : UnreplayedDifference or None
-        Largest difference at times without replay; None if the replay covers the analysed segment.
     corrected : mapping from field of Settings to value
-        Wrong settings of KF that were corrected first.
+        Estimates that replaced wrong settings of KF before the first step.
     sentences : tuple of str
-        Explanations of the difference, largest contribution first.
+        Explanations, largest contribution first.
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times; position differences KF - EKF2, and replay with all steps - EKF2.
+        EKF2 sample times, and position differences at these times before and after all steps.
     cause : str
-        Sentence about the property with the largest contribution.
+        Sentence about the largest contribution.
     """
 
     count: Count
@@ -174,30 +143,22 @@ class DifferenceExplanation(Record, frozen=True, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Fraction of the mean square position difference that ``steps`` do not explain."""
+        """Unexplained fraction of the mean square position difference."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Replace KF properties by EKF2 properties, one after the other, and compare with EKF2.
-
-    The result is without explanatory sentences.
+    """Replace properties of KF by those of EKF2, one after the other, and compare with EKF2.
 
     Parameters
     ----------
     model : Model
     settings : Settings, optional
-        Settings of KF. The time offset must refer to the position source that EKF2 fused.
+        Settings of KF, with the time offset for the position source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
-        Runs of KF along horizontal axes. By default KF is replaced, along north and east, by the
-        first filter of the sequence: KF with EKF2's samples and prediction steps.
-
-    Returns
-    -------
-    dict from axis name to DifferenceExplanation, or Unavailable
-        Unavailable if the replay does not agree with the log.
+        Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
@@ -289,16 +250,13 @@ def explain_by_steps(
 
 
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
-    """Return the filter configurations from KF to EKF2 without output predictor.
-
-    Keys are the names of the EKF2 properties that replace KF properties, one after the other.
-    """
+    """Return the filter configuration after each replacement but the output predictor."""
     flown_settings = inputs.settings
     aid = inputs.aid
     acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.step_s)
     kf_process_noise = {**flown_settings, "EKF2_ACC_NOISE": acceleration_noise}
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
-    # KF's GNSS positions have measurement times as timestamps: the delay is already subtracted
+    # the delay is already subtracted from the timestamps of GNSS positions
     applied_delay_s = flown_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}

@@ -1,10 +1,11 @@
 """Fusion of external vision in addition to GNSS in the EKF2 replay, with a vision frame bias.
 
-The estimated bias adapts within seconds, so vision determines the relative motion and GNSS the
-position. Without GNSS there is no bias: EKF2 then resets its position to the vision position.
-Samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the
-later event. The motion from sample to event is computed from the state and the IMU. Array shapes:
-E events, S filter configurations, k samples per event.
+The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
+Without GNSS there is no bias: EKF2 then resets its position to the vision position. Samples between
+two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at the later event; the motion in
+between is computed from the state and the IMU.
+
+Array shapes: E events, S filter configurations, k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -42,9 +43,9 @@ def vision_samples(
 ) -> Array:
     """Return the vision samples that are fused at each event, shape (8, k, E).
 
-    The rows are position north and east (m), see
-    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; age, measurement time and fusion time
-    (s); reported variances north and east (m²); and 1 for a sample. All are 0 without a sample.
+    Rows: position north and east (m), age, measurement time, fusion time (s), reported variances
+    north and east (m²), and 1 for a sample; see
+    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`.
     """
     vision = inputs.vision
     time_s = segment.time_s
@@ -72,17 +73,13 @@ class VisionFilter:
     sample_arrays : sequence of S ndarrays, shape (8, k, E)
         Results of :func:`vision_samples`.
     enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
-        True while the aiding source is fused.
     parameters : mapping from parameter name to ndarray, shape (S,)
-    has_gate, reported : ndarray of bool, shape (S,)
-        For each filter configuration: True to apply the gate, True to use reported variances.
+    has_gate, uses_reported_noise : ndarray of bool, shape (S,)
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        For each sample: innovation north and east (m, measurement minus state), both innovation
-        variances, and 1 if rejected, 1 if fused, 1 if EKF2 reset its position to the sample. NaN
-        for a sample without an innovation.
+        The first seven of :data:`UPDATE_COLUMNS` for each sample; NaN without an innovation.
     position_reset_m : ndarray, shape (E, S, 2)
         Change of the position by a reset at each event, north and east.
     fused_s : ndarray, shape (S,)
@@ -110,7 +107,7 @@ class VisionFilter:
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.without_gnss = ~enabled[GNSS_POS.name]
-        self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
+        self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
         )
@@ -126,28 +123,22 @@ class VisionFilter:
         self.fused_s = np.full(configuration_count, start_s)
         self.was_without_gnss = self.without_gnss[0]
 
-    def updates(self, configuration: int, end_s: Array) -> pd.DataFrame:
-        """Return the vision updates of one filter configuration at EKF2's measurement times.
+    def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
+        """Return the vision updates of one filter configuration at measurement times.
 
         ``end_s`` is the time of each event.
         """
-        update_log = self.update_log[..., configuration]
+        update_log = self.update_log[..., configuration_index]
         event, slot = np.nonzero(np.isfinite(update_log[:, :, 0]))
-        index = pd.Index(self.measured_at_s[slot, event, configuration], name="time_s")
+        index = pd.Index(self.measured_at_s[slot, event, configuration_index], name="time_s")
         updates = pd.DataFrame(update_log[event, slot], index, UPDATE_COLUMNS[:7])
         return updates.assign(fused_at_s=end_s[event])
 
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
-        """Return state and covariance after fusing the vision samples of one event.
+        """Fuse the vision samples of one event.
 
-        Parameters
-        ----------
-        e : int
-        x, P : ndarray
-        at_event : bool
-            True to fuse the samples of the interval's last step, False for earlier samples.
-        gnss_fused_s : ndarray, shape (S,)
-            Time of the last position fusion from GNSS.
+        ``at_event`` selects the samples of the last prediction step before the event, which EKF2
+        fuses after GNSS. ``gnss_fused_s`` is the time of the last position fusion from GNSS.
         """
         for slot, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():
@@ -178,7 +169,7 @@ class VisionFilter:
             without_gnss != self.was_without_gnss
         )
         is_outside_gate = (
-            (nu * nu > self.gate2 * diagonal).any(axis=1) & self.has_gate & ~has_restarted
+            (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
         is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
         restarts = has_sample & (has_restarted | is_failing)

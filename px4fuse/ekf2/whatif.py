@@ -1,6 +1,6 @@
-"""Comparison of EKF2 as logged, replayed, and replayed with other parameters (what-if table).
+"""Comparison of EKF2 as logged, replayed, and replayed with other parameters.
 
-All columns of the table are evaluated over the same times.
+All columns of this what-if table are evaluated over the same times.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,9 +35,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 what-if"
-# Minimum ratio of the number of logged innovations to the number of replayed innovations: with
-# fewer logged innovations, the time between fusions is unknown
-MIN_COMPLETE_SHARE = 0.9
+# The logged time between fusions is known if the log has this fraction of the replayed innovations
+MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
     "the log has no ground truth",
@@ -49,59 +48,49 @@ HEADING_LOGGED_NOTE = (
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
 HEIGHT_START_NOTE = (
-    ". The replay starts with a height that EKF2 estimated while it declared the acceleration bad, "
-    "so the replayed height may be wrong at first"
+    ". When the replay starts, EKF2 has declared its vertical acceleration bad, so the replayed "
+    "height may be wrong at first"
 )
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
     "with external vision the replay uses the logged EKF2 heading",
-    "Use the logged heading of EKF2.",
+    "Take the heading from the log (vehicle_attitude).",
 )
 HEIGHT_NOT_REPLAYED = Unavailable(
-    "height error", "the replay uses the logged EKF2 height", "Use the logged height of EKF2."
+    "height error",
+    "the replay uses the logged EKF2 height",
+    "Take the height from the log (vehicle_local_position).",
 )
 # Minimum evaluated time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m) that is added in repeated replays: the result of a replay is predictable if
-# this noise hardly changes the result
+# Position noise (m) that is added in repeated replays, to test if the statistics depend on the
+# rejection of single samples
 ADDED_NOISE_M = 0.002
-# Number of repeated replays with added position noise
+# Number of repeated replays
 ADDED_NOISE_RUNS = 4
-# Minimum rejected fraction for which replays are repeated to test if the result is predictable
-MIN_REJECTED_SHARE = 0.02
-# Maximum rejected fraction for a predictable result of a replay
-MAX_REJECTED_SHARE = 0.35
-# Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
+# Replays with a larger rejected fraction are repeated
+MIN_REJECTED_FRACTION = 0.02
+# The statistics of a replay with a larger rejected fraction are not predictable
+MAX_REJECTED_FRACTION = 0.35
+# EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of the mean NIS of two replays with added position noise, for a predictable result
+# Maximum ratio between the mean NIS of repeated replays
 MAX_NIS_RATIO = 1.10
-# Maximum difference of the rejected fractions of two replays with added position noise, for a
-# predictable result
+# Maximum difference between the rejected fractions of repeated replays
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio of the position RMSE of two replays with added position noise, for a predictable
-# result
+# Maximum ratio between the position RMSE of repeated replays
 MAX_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record, frozen=True):
     """EKF2 statistics along one axis in one column of the what-if table.
 
-    Attributes
-    ----------
-    nis_mean : float
-        Mean NIS over all evaluated samples, including rejected samples.
-    nis_band : (float, float)
-        95 % band of the mean NIS of a consistent filter.
-    innovation_std_m : float
-    sigma_p_median_m : float or Unavailable
-        Median reported σ of the position.
-    position_rmse_to_truth_m : float or Unavailable
-        RMSE of the published position against ground truth.
+    ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
     """
 
     nis_mean: NotNegative
@@ -122,40 +111,30 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def is_predictable(self) -> bool:
-        """True with few rejections and no height reset: the replay does not model height resets."""
+        """False with many rejections or with a height reset, which the replay does not model."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
-        return not has_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
+        return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """Column of the what-if table: EKF2 logged, replayed, or replayed with other parameters.
+    """EKF2 statistics in one column of the what-if table: logged, replayed, or changed.
 
     Attributes
     ----------
     changed : mapping
-        Values of the changed parameters, by PX4 name.
+        Changed parameters, by PX4 name.
     without : mapping from PX4's name of an aiding source to float
-        Time (s) from which the aiding source is not fused.
-    north, east : AxisSummary
-    samples : int
-    rejected_fraction : float
-    velocity_rejected_fraction : float or None
-        Rejected fraction of the GNSS velocities; None if EKF2 fused no GNSS velocity.
-    longest_without_fusion_s : float or Unavailable
+        Time (s) from which the source is not fused.
     resets : int
-        Number of resets of the horizontal position.
+        Number of horizontal position resets.
     heading_error_mean_deg : float or Unavailable
-        Mean of heading minus true heading, clockwise seen from above.
-    heights : mapping from PX4's name of a height sensor to HeightSummary
-        Replayed height sensors; empty if the logged EKF2 height is used.
-    others : mapping from PX4's name of an aiding source to HeightSummary
-        Vision that is fused in addition to GNSS, north and east together; empty without it.
-    height_rmse_to_truth_m : float or Unavailable
+        Mean of heading minus true heading, clockwise from above.
+    heights, others : mapping from PX4's name to HeightSummary
+        Replayed height sensors, and vision that is fused in addition to GNSS.
     late, lost : int
-        Number of samples that arrived after the fusion horizon had passed their measurement time:
-        fused late, and never fused.
+        Number of samples that were fused late, and that were too late to be fused.
     is_predictable : bool
-        False if the rejection of a single sample may change the result.
+        False if the statistics depend on the rejection of single samples.
     """
 
     changed: Mapping[str, float]
@@ -177,7 +156,6 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def axes(self) -> dict[str, AxisSummary]:
-        """Statistics by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
     @property
@@ -198,20 +176,17 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Table of EKF2 logged, replayed, and replayed with other parameters (what-if table).
+    """Statistics of EKF2 as logged, replayed, and replayed with other parameters.
 
     Attributes
     ----------
     agreement : Agreement
-        Agreement of the replay with the log; all other results require a good agreement.
-    logged, replayed : Summary
-        Column from the log, and column from the replay with the logged parameters.
+        Agreement of the replay with the log.
     whatif : tuple of Summary
         One column per set of changed parameters.
     evaluated_s : tuple of (float, float)
-        Evaluated times (s), the same for all columns.
     notes : tuple of str
-        Limitations of the replay, one sentence each.
+        Limitations of the replay.
     """
 
     agreement: Agreement
@@ -235,14 +210,9 @@ def what_if(
     ----------
     model : Model
     settings : sequence of mapping
-        Changed parameters of each replay, by PX4 name and in PX4's units.
+        Changed parameters of each replay, by PX4 name.
     without : mapping from PX4's name of an aiding source to float, optional
-        Time (s) from which the aiding source is not fused, and all columns are evaluated.
-
-    Returns
-    -------
-    WhatIf or Unavailable
-        Unavailable if the replay does not agree with the log.
+        Time (s) from which the source is not fused; only later times are evaluated.
 
     Raises
     ------
@@ -257,8 +227,7 @@ def what_if(
     evaluated_s = model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
-        # later segments are not used, because the disabled source affected the logged states from
-        # which they start
+        # later segments start from logged states, which the source affected
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -341,13 +310,13 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
 def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Mark results that change with added position noise as not predictable."""
+    """Set ``is_predictable`` to False where added position noise changes the statistics."""
     runs = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
         for repeated_runs in runs
         if repeated_runs[0].changed
-        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
+        and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
     changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
     for seed in range(ADDED_NOISE_RUNS if changes else 0):
@@ -364,7 +333,7 @@ def _mark_unpredictable(
             rejected_fractions.append(summary.rejected_fraction)
         is_predictable = (
             all(height.is_predictable for height in summary.heights.values())
-            and max(rejected_fractions, default=0.0) <= MAX_REJECTED_SHARE
+            and max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION
             and _results_agree([summary, *noisy_summaries])
         )
         marked_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
@@ -372,7 +341,7 @@ def _mark_unpredictable(
 
 
 def _results_agree(runs: Sequence[Summary]) -> bool:
-    """Return True if NIS, rejected fraction and RMSE of all replays agree: predictable result."""
+    """Return True if repeated replays have nearly the same statistics."""
     rmse = [
         error for summary in runs if isinstance(error := summary.position_rmse_to_truth_m, float)
     ]
@@ -395,8 +364,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
             f"{replay.lost} samples arrive after the fusion horizon",
             "Choose another parameter value.",
         )
-    # the position variance grows between updates and drops at an update: use the values before and
-    # after each update
+    # position variance before and after each update
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (
@@ -444,7 +412,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
-    if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
+    if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed:
         fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
         longest_gap_s = _longest_between_fusions(np.concatenate([fused_s, resets]), evaluated_s)
     # a flight with a replay has an attitude
@@ -490,10 +458,9 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """Compute a column of the what-if table.
+    """Compute one column of the what-if table; ``more`` are further fields of :class:`Summary`.
 
-    ``variance`` is the position variance, interpolated to the times of the logged variance; if
-    None, the logged variance is used. ``more`` contains further fields of :class:`Summary`.
+    Without ``variance``, the logged position variance is used.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -539,7 +506,6 @@ def _make_summary(
 def _innovation_statistics(
     updates: pd.DataFrame, *axes: AxisName
 ) -> tuple[float, tuple[float, float], float]:
-    """Return mean NIS, its 95 % band and the standard deviation of the innovations of all axes."""
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
     S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])
     return float(np.mean(nu**2 / S)), nis_band(len(nu)), float(np.std(nu))
@@ -577,7 +543,6 @@ def _heading_error(
 
 
 def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
-    """Return the longest time (s) without a fusion, from start to end of the evaluated times."""
     ends = [evaluated_s[0][0], evaluated_s[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
@@ -594,13 +559,13 @@ def _deviation_note(
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
     height = (
-        f"; the published height differs by at most {down.max():.3g} m"
+        f". The published height differs by at most {down.max():.3g} m"
         if heights & {*replays_without}
         else ""
     )
     give_up_note = (
-        "; without a horizontal aiding source EKF2 stops providing a position after "
-        "EKF2_NOAID_TOUT (5 s), while the replay dead-reckons"
+        ". The replay continues with the IMU alone; EKF2 stops publishing a position after "
+        "EKF2_NOAID_TOUT (5 s)"
     )
     at_s = difference.index[distance.argmax()]
     return (
@@ -619,7 +584,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise:g} m)"
         )
     if replay.late or replay.lost:
-        remedy = "" if model.inputs.rules.uses_delay_as_horizon else ": raise EKF2_DELAY_MAX"
+        remedy = "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
         # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
         # prediction step
         samples = max(len(replay.updates), replay.late) + replay.lost
@@ -630,5 +595,4 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
 
 
 def _change_text(replay: Ekf2Replay) -> str:
-    """Return the changed parameters as text, or "As flown"."""
     return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"

@@ -68,7 +68,6 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
             "gap": list(events.gaps),
             "dropout": list(events.dropouts),
             "ground": list(events.ground),
-            "modes": [[mode.start_s, mode.end_s, mode.name] for mode in events.modes],
             "reset": list(events.resets_s),
         },
         "command": _command_data(request, analysis),

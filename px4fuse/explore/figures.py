@@ -24,7 +24,7 @@ from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 # Options of a drawing function of Bokeh
 Style = dict[str, Any]
 # Columns of all Bokeh data sources; the script of the page fills those that a plot needs
-COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right text"
+COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
 # the report
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
@@ -245,16 +245,6 @@ def _event_plot(data: Data, time_range: Range1d) -> Any:
         fill_color="#7d8894",
         line_color="#7d8894",
         name="event",
-    )
-    fig.text(
-        "left",
-        "row",
-        "text",
-        source=source,
-        text_font_size="11px",
-        text_baseline="middle",
-        x_offset=3,
-        name="ink",
     )
     _add_cursor(fig, name="cursor")
     return fig

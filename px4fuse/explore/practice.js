@@ -3,17 +3,16 @@
 const Practice = (() => {
   const count = Number($("quiz").dataset.flights), address = new URLSearchParams(location.hash.slice(1));
   const savedAnswers = (address.get("answers") ?? "").split("~").slice(0, count);
-  // answer to each flight: faults, size and time, separated by "|"
+  // answer to each flight: faults, separated by blanks
   const answers = Array.from({ length: count }, (_, i) => savedAnswers[i] ?? "");
   const requested = Math.trunc(Number(address.get("flight") ?? 1)) - 1;
   const current = requested >= 0 && requested < count ? requested : 0;
   const isOpen = answers[current] === "";
 
   const readSolution = (number) => inflate($(`key-${number}`).textContent).json();
-  const faultsOf = (answer) => answer.split("|")[0].split(" ");
   /* Points of an answer: 1 for all faults of the flight, 0.5 for one of two, 0 with a wrong fault */
   function points(answer, { right }) {
-    const chosen = faultsOf(answer);
+    const chosen = answer.split(" ");
     if (chosen.some((fault) => !right.includes(fault))) return 0;
     return chosen.length === right.length ? 1 : 0.5;
   }
@@ -27,12 +26,10 @@ const Practice = (() => {
     $("quiz-title").textContent = `Flight ${current + 1} of ${count}: find the fault`;
     // commands need a log file, which a simulated flight does not have
     for (const id of ["as-report", "whatif", "task"]) $(id).hidden = true;
-    const boxes = queryAll("[name=choice]"), fields = [$("quiz-size"), $("quiz-time")];
-    const [, ...typed] = answers[current].split("|");
-    fields.forEach((field, i) => { field.value = typed[i] ?? ""; });
-    for (const input of [...boxes, ...fields]) input.disabled = !isOpen;
+    const boxes = queryAll("[name=choice]"), chosen = answers[current].split(" ");
     for (const box of boxes) {
-      box.checked = faultsOf(answers[current]).includes(box.value);
+      box.disabled = !isOpen;
+      box.checked = chosen.includes(box.value);
       box.addEventListener("change", () => {
         if (!box.checked) return;
         for (const other of boxes) {
@@ -44,7 +41,7 @@ const Practice = (() => {
     onClick("quiz-check", () => {
       const chosen = boxes.filter(({ checked }) => checked).map(({ value }) => value);
       if (!chosen.length) { $("quiz-message").textContent = "Select at least one mistake, or “no mistake”."; return; }
-      answers[current] = [chosen.sort().join(" "), ...fields.map(({ value }) => value.replace(/[|~]/g, " ").trim())].join("|");
+      answers[current] = chosen.sort().join(" ");
       goTo(current);
     });
     const nextOpen = answers.findIndex((answer, i) => answer === "" && i !== current);
@@ -53,7 +50,7 @@ const Practice = (() => {
     $("quiz-again").hidden = answers.every((answer) => answer === "");
     onClick("quiz-again", () => { answers.fill(""); goTo(0); });
     await score();
-    if (!isOpen) showSolution(page, await readSolution(current), boxes);
+    if (!isOpen) showSolution(page, await readSolution(current));
   }
   async function score() {
     let sum = 0, done = 0;
@@ -64,29 +61,19 @@ const Practice = (() => {
     }
     $("quiz-score").textContent = done === 0 ? "" : `Score: ${sum} of ${done} answered flights${done === count ? ", all answered" : ""}`;
   }
-  /* Show the answer beside the solution, and the card of the flight */
-  function showSolution(page, solution, boxes) {
+  /* Show the solution and the card of the flight */
+  function showSolution(page, solution) {
     const score = points(answers[current], solution), box = $("quiz-solution");
-    const [, size, time] = answers[current].split("|");
-    const correct = (name) => solution.mistakes.map((mistake) => mistake[name]).join("; ");
-    const faults = boxes.filter(({ checked }) => checked).map(({ parentElement }) => parentElement.textContent.trim());
-    const heading = make("h2", { 1: "✓ Correct", 0.5: "Half correct", 0: "✕ Wrong" }[score]);
     box.classList.toggle("right", score === 1);
-    const table = make("table"), head = table.createTHead().insertRow();
-    for (const text of ["", "your answer", "correct answer"]) head.append(make("th", text, { scope: "col" }));
-    const body = table.createTBody();
-    for (const [name, yours, fallback] of [["fault", faults.join("; "), "no mistake"], ["size", size, "–"], ["time", time, "–"]]) {
-      body.insertRow().append(make("th", name, { scope: "row" }), make("td", yours || "–", { dir: "auto" }),
-        make("td", correct(name) || fallback));
-    }
-    box.replaceChildren(heading, table);
-    for (const { symptom, view, span } of solution.mistakes) {
+    box.replaceChildren(make("h2", { 1: "✓ Correct", 0.5: "Half correct", 0: "✕ Wrong" }[score]));
+    if (!solution.mistakes.length) box.append(make("p", "The flight contains no fault."));
+    for (const { fault, size, time, symptom, view, span } of solution.mistakes) {
       const button = make("button", "Show in the plots");
       button.addEventListener("click", () => {
         page.open(view);
         if (span !== null) page.setSpan(span[0] - 3, span[1] + 3);
       });
-      box.append(make("p", `${symptom} `, { className: "note" }), button);
+      box.append(make("p", `${fault}: ${size}, ${time}. ${symptom}`), button);
     }
     box.hidden = false;
     $("card").innerHTML = solution.card; // px4fuse has escaped its texts

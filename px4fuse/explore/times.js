@@ -49,19 +49,18 @@ const Times = (() => {
 
     // ------------------------------------------------------------------ events
     function drawEvents(axis) {
-      const rows = { row: [], left: [], right: [], text: [] };
-      const add = (row, low, high, text) => {
-        rows.row.push(row); rows.left.push(low); rows.right.push(high); rows.text.push(text);
+      const rows = { row: [], left: [], right: [] };
+      const add = (row, low, high) => {
+        rows.row.push(row); rows.left.push(low); rows.right.push(high);
       };
       const { events } = flight, minWidth = (ends[1] - ends[0]) / 800;
-      for (const [row, spans] of [["mode", events.modes], ["on the ground", events.ground],
-        ["gap in source", events.gap], ["log dropout", events.dropout]]) {
-        for (const [low, high, name = ""] of spans) add(row, low, high, name);
+      for (const [row, spans] of [["on the ground", events.ground], ["gap in source", events.gap], ["log dropout", events.dropout]]) {
+        for (const [low, high] of spans) add(row, low, high);
       }
       if (!isText(axis.ekf2)) {
         const [time, , , rejected] = axis.ekf2.innovations;
         for (const [row, times] of [["EKF2 reset", events.reset], ["EKF2 rejected", time?.filter((_, i) => rejected[i]) ?? []]]) {
-          for (const t of times) add(row, t, t + minWidth, "");
+          for (const t of times) add(row, t, t + minWidth);
         }
       }
       setSource("strip", rows);

@@ -39,11 +39,11 @@ COARSE_MAX_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
 # Initial value of the fraction of outliers
-START_OUTLIER_SHARE = 0.005
+START_OUTLIER_FRACTION = 0.005
 # Initial value of the ratio of the outliers' σ to SIGMA_Z
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
-MAX_OUTLIER_SHARE = 0.4
+MAX_OUTLIER_FRACTION = 0.4
 # While outliers are estimated, SIGMA_Z exceeds its robust estimate (median) at most by this factor
 MAX_SIGMA_Z_RATIO = 1.2
 # Expectation maximisation has converged if no outlier probability changes by more than this
@@ -300,7 +300,7 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    outlier_share = START_OUTLIER_SHARE
+    outlier_share = START_OUTLIER_FRACTION
     width = START_OUTLIER_WIDTH
     noises = start
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
@@ -320,7 +320,7 @@ def maximise_likelihood(
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
         outlier_share = float(
-            np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE)
+            np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_FRACTION)
         )
         outlier_square = np.sum(probability * squares) / max(np.sum(probability * count), 1e-9)
         width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))

@@ -347,10 +347,10 @@ def _test_step(
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped)
-    size = design_fit.coefficients[columns]
+    jump_m = design_fit.coefficients[columns]
     covariance = design_fit.covariance[np.ix_(columns, columns)]
-    size = size / design_fit.axis_rms
-    chi_square = float(size @ np.linalg.solve(covariance, size))
+    jump_m = jump_m / design_fit.axis_rms
+    chi_square = float(jump_m @ np.linalg.solve(covariance, jump_m))
     if chi_square < chdtri(len(columns), false_alarm_p):
         return None
     return Jump(time_s, tuple(design_fit.estimate(int(column)) for column in columns), chi_square)

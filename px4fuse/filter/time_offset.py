@@ -90,8 +90,6 @@ class ClockOffset(Record, frozen=True, kw_only=True):
         p-value of a constant offset (likelihood ratio test); None with one part.
     curve_s, curve_drop : ndarray, shape (n,)
         Time offsets (s), and the decrease of the log-likelihood from its maximum.
-    sigma_a_m_s2, sigma_z_m : float
-        Noises at the maximum of the likelihood.
     """
 
     offset_s: float

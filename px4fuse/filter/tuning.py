@@ -47,7 +47,7 @@ MAP_HALF_WIDTH_SIGMAS = 4.5
 # Minimum number of positions for an estimate of the noises
 MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
-MAX_OUTLIER_SHARE = 0.3
+MAX_OUTLIER_FRACTION = 0.3
 # Factors on KF's SIGMA_A for the initial values of the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
@@ -114,10 +114,6 @@ class AxisTuning(Record, frozen=True, kw_only=True):
         Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
         False if the IMU rate is too low; KF's SIGMA_A is then an upper bound of the noise.
-    name : str
-        Axis name, or "horizontal".
-    outlier_time_s : ndarray, shape (k,)
-        Timestamps of the outliers.
     noises : Noises
         Maximum-likelihood noises, including the random walk of a drifting source.
     """
@@ -244,7 +240,7 @@ def tune_axes(
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
-    if np.mean(is_outlier) > MAX_OUTLIER_SHARE:
+    if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             f"estimate of the noises ({name})",
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "

@@ -92,15 +92,6 @@ class Columns:
     ]
 
 
-@dataclass(frozen=True)
-class FlightMode:
-    """Time interval (s) in one flight mode, with the name that QGroundControl shows."""
-
-    start_s: float
-    end_s: float
-    name: str
-
-
 class Alignment(Record, frozen=True, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
@@ -418,13 +409,6 @@ class Truth:
     __repr__ = one_line_repr
 
 
-MODES_NOT_LOGGED = Unavailable(
-    "flight modes",
-    "vehicle_status is not logged or not usable",
-    "Record with SDLOG_PROFILE bit 0 (default).",
-)
-
-
 # Flights are compared by identity (eq=False), because caches use flights as keys
 @dataclass(frozen=True, eq=False)
 class Flight:
@@ -462,7 +446,6 @@ class Flight:
     unused: tuple[UnusedData, ...] = ()
     # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
-    modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
     # Intervals in which PX4's failure detector reports roll or pitch beyond the limits
     tumble_spans: Spans = ()
     # Barometer height ``down_m`` with unknown zero

@@ -39,7 +39,7 @@ SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # Fields of Flight that the JSON output of px4fuse info contains without change
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Displayed name of each kind of data in a flight, by its name in Flight.streams
+# Label of each kind of data, by its name in Flight.streams
 PART_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -81,17 +81,7 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps in one kind of data: sample intervals that are longer than ``limit_s``.
-
-    Attributes
-    ----------
-    count : int
-    total_s, longest_s : float
-        Sum and maximum of the gap lengths; 0 without gaps.
-    limit_s : float
-        IMU: the larger of 0.1 s and five median sample intervals, as in KF. Other data: the larger
-        of 1 s and five median sample intervals.
-    """
+    """Sample intervals that are longer than ``limit_s``: number, sum and maximum."""
 
     count: int
     total_s: float
@@ -101,28 +91,22 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Source:
-    """Kind of data in a flight with topics, rate and gaps, or the reason why the data are missing.
+    """One kind of data in a flight with topics, rate and gaps, or the reason why it is missing.
 
     Attributes
     ----------
     part : str
         Kind of data: a value of :data:`PART_LABELS`.
     name : str
-        Name of a position track, else of the first topic; empty if the data are missing.
-    topics : tuple of str
-    clock, log : str
-        Clock of the timestamps, and name of the file.
+        Name of a position track, or else of the first topic.
+    log : str
+        Name of the file.
     samples : int or None
-        Number of samples; None for the land detector, of which a Flight contains no samples.
-    rate_hz : float or None
-        Median rate, on which gaps have no effect; None with less than two samples.
-    gaps : Gaps or None
+        Number of samples; None for the land detector.
     start_s, end_s : float or None
         Times of the first and last sample, in seconds after the first data.
     chosen : bool
         True for the position source that ``px4fuse compare`` uses by default.
-    description : str
-        Description of a position track.
     unavailable : str
         Reason why the data are missing; empty if they are available.
     """
@@ -159,10 +143,7 @@ class Inventory:
     segment : Segment or None
         Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
-    advice : tuple of LoggingAdvice
-        Different actions, the most important first.
-    notes : tuple of str
-        Sentences about damage of the file, clocks and EKF2 data.
+        Possible and impossible analyses.
     """
 
     flight: Flight
@@ -200,11 +181,7 @@ def take_inventory(flight: Flight) -> Inventory:
         advice=_logging_advice(flight, comparison, remedy),
         notes=(
             *log.damage,
-            *(
-                ("the log ends in flight and does not contain the landing",)
-                if is_incomplete
-                else ()
-            ),
+            *["the log ends in flight and does not contain the landing"] * is_incomplete,
             *log.notes,
             *(() if comparison is None else comparison.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
@@ -224,16 +201,13 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
 
 
 def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
-    """Return all data of a flight except positions, by their names in Flight.streams.
-
-    Without EKF2 data, the result contains the EKF2 state as unavailable, and no other EKF2 data.
-    EKF2 innovations are along the axis with the most samples.
-    """
+    """Return all data of a flight except positions, by their names in Flight.streams."""
     ekf2, truth = flight.ekf2, flight.truth
     data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_part["ekf2_state"] = ekf2
     else:
+        # innovations along the axis with the most samples
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -289,6 +263,7 @@ def _source(
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
+    """Measure gaps of more than 0.1 s (IMU, as in KF) or 1 s, and of five median intervals."""
     intervals = np.diff(samples.index.to_numpy())
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
@@ -389,7 +364,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # advice on data other than main_parts is for ULogs, because only PX4 can log these data
+    # a MAVLink recording can contain the main parts only, so other advice is for ULogs
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (part.remedy, part.what)

@@ -20,7 +20,7 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Axes or elements of a vector or quaternion, by the placeholder in columns.csv
+# Names that replace a placeholder in columns.csv, in one row for each name
 COMPONENTS = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),
@@ -40,7 +40,7 @@ NO_POSITION = Unavailable(
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Exported table ``data``, and ``columns``: the data dictionary with a row for each column."""
+    """Exported table, and the rows of the data dictionary that describe its columns."""
 
     name: str
     data: pd.DataFrame
@@ -56,25 +56,15 @@ def with_best_source(flight: Flight) -> Flight:
 
 
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
-    """Return the tables of a flight: one row per sample, one unit per column.
+    """Return the tables of a flight by name, with one row per sample.
 
-    Returns
-    -------
-    mapping from table name to DataFrame
-        The first column of a time series is ``time_s``. Table names are valid file names. Data that
-        are missing in the log have no table; see :func:`unavailable_parts`.
+    Data that are missing in the log have no table; see :func:`unavailable_parts`.
     """
     return {table.name: table.data for table in _tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
-    """Return the data dictionary, with one row per column of every table.
-
-    Returns
-    -------
-    DataFrame
-        Columns of :data:`DICTIONARY_COLUMNS`; units are ASCII.
-    """
+    """Return the data dictionary (:data:`DICTIONARY_COLUMNS`), with one row per table column."""
     descriptions = [table.columns for table in _tables(flight)]
     if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
@@ -130,24 +120,17 @@ def _column_descriptions() -> pd.DataFrame:
 def _table(
     name: str,
     data: pd.DataFrame,
-    origin: tuple[tuple[str, ...], str] = ((), ""),
-    described_name: str = "",
+    topics_and_clock: tuple[tuple[str, ...], str] = ((), ""),
+    name_in_csv: str = "",
     **values: str,
 ) -> DescribedTable:
-    """Make a table with the columns that columns.csv lists for it.
+    """Make a table with the columns that columns.csv lists for ``name_in_csv`` (default ``name``).
 
-    Parameters
-    ----------
-    origin : (tuple of str, str)
-        Topics and clock of the data.
-    described_name : str
-        Name of the table in columns.csv; by default ``name``.
-    **values
-        Values for the names in braces in columns.csv.
+    ``values`` replace the names in braces in columns.csv.
     """
-    tables_in_csv = ["any table"] * ("time_s" in data) + [described_name or name]
+    tables_in_csv = ["any table"] * ("time_s" in data) + [name_in_csv or name]
     columns = _column_descriptions().loc[tables_in_csv].map(lambda cell: cell.format(**values))
-    topics, clock = origin
+    topics, clock = topics_and_clock
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
 
@@ -174,25 +157,21 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
         yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
     for name, track in _named_tracks(flight):
         values = {"frame": track.frame, "description": track.description}
-        origin = (track.topics, track.clock)
-        yield _table(name, _with_time_column(track.samples), origin, "position", **values)
+        topics_and_clock = (track.topics, track.clock)
+        data = _with_time_column(track.samples)
+        yield _table(name, data, topics_and_clock, "position", **values)
         if track.orientation is not None:
-            orientation_table = _with_time_column(track.orientation)
-            yield _table(
-                f"orientation_{name.partition('_')[2]}",
-                orientation_table,
-                origin,
-                "orientation",
-                **values,
-            )
+            orientation_name = name.replace("position_", "orientation_", 1)
+            data = _with_time_column(track.orientation)
+            yield _table(orientation_name, data, topics_and_clock, "orientation", **values)
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2_tables(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
         yield from _stream_table(flight, "truth", flight.truth.samples)
     log = flight.log
     if not isinstance(flight.airborne, Unavailable):
-        spans = _numeric_table(["time_s", "end_s"], flight.airborne)
-        yield _table("airborne", spans, _topics_and_clock(flight, "airborne"))
+        flight_times = _numeric_table(["time_s", "end_s"], flight.airborne)
+        yield _table("airborne", flight_times, _topics_and_clock(flight, "airborne"))
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
         yield _table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
@@ -231,17 +210,17 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
         innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
         yield from _stream_table(flight, "ekf2_innovations", innovation_table)
     yield from _stream_table(flight, "ekf2_fusing", ekf2.fusing)
-    origin = _topics_and_clock(flight, "ekf2_state")
-    deltas = [reset.delta for reset in ekf2.resets]
-    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], deltas)
+    topics_and_clock = _topics_and_clock(flight, "ekf2_state")
+    delta_rows = [reset.delta for reset in ekf2.resets]
+    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
-    yield _table("resets", resets, origin)
+    yield _table("resets", resets, topics_and_clock)
     # the start time of the first EKF2 instance is minus infinity in a Flight
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
     instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
-    yield _table("instances", instances, origin)
+    yield _table("instances", instances, topics_and_clock)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:

@@ -24,8 +24,7 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum UNIX time (s) in options, if the timestamps of the trajectory are UNIX time: smaller times
-# are times after the first pose
+# Minimum value (s) that options state as UNIX time; smaller times count from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
@@ -49,13 +48,10 @@ def analyse(
     Parameters
     ----------
     source : LoopSource
-        Trajectory, and the flight of which it is a track, if any.
     request : LoopRequest, optional
-        Options. Times are on the clock of the trajectory; with UNIX timestamps, small times count
-        from the first pose. The default landing place is from the ground truth in the log, or else
-        the take-off place.
+        Options, with times on the clock of the trajectory.
     reference : Trajectory, optional
-        Additional reference for the scores. The ground truth in the log is always used.
+        Reference for the scores, in addition to the ground truth in the log.
 
     Raises
     ------
@@ -80,12 +76,9 @@ def analyse(
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
-    end_truth = truth if request.closed_loop and request.landed_at is None else None
-    truth_end = (
-        None
-        if end_truth is None
-        else loop_segment.read_end_from_truth(path, end_truth, segment, rests_at_ends)
-    )
+    truth_end = None
+    if truth and request.closed_loop and request.landed_at is None:
+        truth_end = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
     true_end = _find_true_end(path, request, truth_end, segment, is_assessed=is_assessed)
     given_closures = [
         GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
@@ -196,17 +189,14 @@ def _find_true_end(
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True if the track follows an external position source that is not odometry."""
+    """Return True if the positions do not drift: KF or EKF2 with a positioning system."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Choose key frames of a path.
-
-    Return the indices of the key frames, and the distance (m) along the key frames at each pose.
-    """
+    """Return the indices of the key frames, and the distance (m) along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[frame_indices])
@@ -259,10 +249,7 @@ def _compute_heading_error(
 
 
 def truth_of(flight: Flight) -> Trajectory | None:
-    """Return the ground truth of a flight as a trajectory.
-
-    Return None if the log contains no ground truth.
-    """
+    """Return the ground truth of a flight as a trajectory, if the log contains it."""
     try:
         return trajectory_of(flight, "truth")
     except MissingDataError:

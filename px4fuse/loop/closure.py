@@ -13,8 +13,7 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# Conversion to a frame with z down, by original frame: indices of forward (or north), right (or
-# east) and down in (x, y, z), their signs, new frame, note for the user
+# Order and signs of x, y and z in a frame with z down, name of this frame, and note for the user
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],

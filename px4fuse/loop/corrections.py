@@ -1,4 +1,4 @@
-"""Corrections of a loop: tests of the closures, corrected paths, and scores of each path."""
+"""Corrections of odometry by loop closures: gate, corrected paths, and scores of each path."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -46,7 +46,7 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing: Closure | None,
 ) -> dict[CorrectionName, Corrected]:
-    """Distribute the closure error over positions (UAT 366, Example 2), and over headings, too."""
+    """Distribute the closure error along the path: over positions only, and also over headings."""
     if landing is not None and not landing.accepted:
         misclosure_m = _unavailable_by_gate("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
@@ -75,10 +75,7 @@ def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test the loop closures, which are the last edges of the graph, against odometry.
-
-    Return an empty tuple without a graph.
-    """
+    """Test the loop closures, which are the last edges of the graph, against odometry."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
@@ -102,7 +99,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with accepted closures only, and robustly.
+    """Optimise the pose graph three times: with all closures, with gated closures, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -178,7 +175,7 @@ def score_paths(
     corrected_paths: Mapping[CorrectionName, Corrected],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
-    """Compute ATE and RPE of odometry and corrected paths, with the time offset of the odometry."""
+    """Compute ATE and RPE of the odometry, and of corrected paths with the same time offset."""
     offsets: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

@@ -105,15 +105,12 @@ def choose_loop_segment(
         )
     inside_s = max(low_s, span_s[0]), min(high_s, span_s[1])
     if inside_s != (low_s, high_s) and inside_s[0] < inside_s[1]:
-        reason, (low_s, high_s) = f"{reason}, limited to the time of the data", inside_s
+        reason, (low_s, high_s) = f"{reason}, as far as the track has poses", inside_s
     return Segment(low_s, high_s, reason, flight_s), rests_at_ends
 
 
 def heading_change_deg(path: Trajectory) -> float | None:
-    """Return final minus initial heading (°), clockwise.
-
-    Return None if the path has no orientations.
-    """
+    """Return final minus initial heading (°), clockwise; None without orientations."""
     if path.rotation is None:
         return None
     return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
@@ -162,10 +159,7 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
 def read_end_from_truth(
     path: Trajectory, truth: Trajectory, segment: Segment, rests_at_ends: bool
 ) -> TrueEnd | str:
-    """Return the landing place from the ground truth in the log, or the reason for none.
-
-    The ground truth is rotated to the odometry frame by the difference of the initial headings.
-    """
+    """Return the true landing place in the odometry frame, or the reason why it is unknown."""
     try:
         true_path = cut_trajectory(truth, segment, rests_at_ends)
     except TrajectoryError as error:

@@ -131,24 +131,12 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class CorrectedPath(Record, frozen=True, kw_only=True):
-    """Corrected path, or uncorrected odometry, with its scores against each reference.
+    """Corrected path, or uncorrected odometry, with its scores against each reference."""
 
-    Attributes
-    ----------
-    correction_max_m, correction_rms_m : float
-        Size of the correction.
-    cost_initial, cost, iterations, converged
-        See :class:`~px4fuse.trajectory.graph.solver.Solution`; None without pose graph.
-    scores : mapping from reference name to Evaluation or Unavailable
-    name : str
-    trajectory : Trajectory
-        All poses of the segment, corrected.
-    solution : Solution or None
-        Solution of the pose graph; None for a correction without pose graph.
-    """
-
+    # Largest and RMS displacement of the poses by the correction
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
+    # Fields of the pose graph solution; None for a correction without pose graph
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None
@@ -162,23 +150,18 @@ class CorrectedPath(Record, frozen=True, kw_only=True):
 class Loop(Record, frozen=True, kw_only=True):
     """Result of ``px4fuse loop``: path, landing place, closure errors and corrections.
 
-    ``closure_error_m`` is the distance between measured and true end, and ``closure_percent`` this
-    distance in per cent of the path length. ``is_absolute_track`` is True if the track follows a
-    positioning system and does not drift. The correction ``by_distance_plain`` changes positions
-    only (UAT 366, Example 2). ``by_distance`` also changes headings, if the heading error is
-    known.
-
     Attributes
     ----------
+    closure_error_m, closure_percent : float or None
+        Distance between measured and true end: in m, and in per cent of the path length.
+    is_absolute_track : bool
+        True if the positions do not drift, because they are from a positioning system.
     distance_m : ndarray, shape (n,)
         Distance along the key frames at each pose.
     graph : PoseGraph or Unavailable
         Pose graph with all closures, before optimisation.
-    references : tuple of Trajectory
     original_frame : Frame
         Frame of the trajectory before the conversion to z down.
-    is_assessed : bool
-        True if the flight is an assignment, so that its findings are withheld.
     """
 
     track: str
@@ -223,7 +206,7 @@ class Loop(Record, frozen=True, kw_only=True):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Paths for reports: all available paths that differ from the other paths."""
+        """Available paths without duplicates."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")

@@ -14,11 +14,10 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of the reported position variance at the end of the path to that at its start, for
-# using the reported variances: with less growth, the default drift is used
+# Minimum growth of the reported position variance along the path, for using reported variances
+# instead of the default drift
 MIN_VARIANCE_GROWTH = 2.0
-# Minimum variance of an odometry edge as fraction of the default drift: a reported growth may be
-# zero
+# Minimum variance of an odometry edge as fraction of the default: avoids a division by zero
 MIN_VARIANCE_FRACTION = 1e-2
 # Fraction of the path at both ends from which start and end variances are taken
 END_FRACTION = 0.1
@@ -65,8 +64,8 @@ def odometry_variances(
     if position_growth is not None:
         translation = np.maximum(position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation)
         origin_texts.append(
-            "the translation variances of the odometry are the growth of the logged position "
-            "variances"
+            "the translation variances of the odometry are computed from the increase of the "
+            "logged position variances"
         )
     elif path.position_variance_m2 is not None:
         origin_texts.append("the logged position variances do not grow, so they are not used")
@@ -74,8 +73,8 @@ def odometry_variances(
     if rotation_growth is not None:
         rotation = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation)
         origin_texts.append(
-            "the rotation variances of the odometry are the growth of the logged orientation "
-            "variances"
+            "the rotation variances of the odometry are computed from the increase of the logged "
+            "orientation variances"
         )
     return translation, rotation, "; ".join(origin_texts)
 
@@ -101,23 +100,15 @@ def build_pose_graph(
     closures_with_end: Sequence[ClosureWithEnd],
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
-    """Build the pose graph of a path: odometry edges between successive nodes, and closures.
+    """Build the pose graph of a path (z down): odometry edges between nodes, then closures.
 
-    Parameters
-    ----------
-    path : Trajectory
-        Path in a frame with z down, with orientations.
-    frames : ndarray of int, shape (f,)
-        Indices of the poses that are key frames.
-    closures_with_end : sequence of ClosureWithEnd
-        Loop closures; the closure from landing has the landing place.
+    ``frames`` are the indices of the key frames.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
-        Pose graph; odometry edges are first, then closures in the given order.
     nodes : ndarray of int, shape (k,)
-        Indices of the poses that are nodes: key frames, and poses nearest to the times of closures.
+        Indices of the nodes: key frames, and the poses nearest to the times of closures.
     statement : str
         Sentence on the origin of the variances.
     """

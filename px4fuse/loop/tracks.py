@@ -96,9 +96,8 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     notes = ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
-        state, resets = continuous_state(
-            track_data, source, Segment(0.0, flight.log.duration_s, "the whole log")
-        )
+        segment = Segment(0.0, flight.log.duration_s, "")
+        state, resets = continuous_state(track_data, source, segment)
         notes += [resets] if resets else []
     return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
@@ -168,10 +167,7 @@ def _make_trajectory(
 
 
 def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
-    """Return the reported variances, shape (n, 3).
-
-    Return None if any value is missing.
-    """
+    """Return the reported variances, shape (n, 3); None if any value is missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
@@ -239,7 +235,7 @@ def read_source(
     if is_g2o(path):
         raise TrajectoryError(
             f"{display_name(path)} is a pose graph, not a trajectory.",
-            f"Optimise it with px4fuse loop {display_name(path)}.",
+            f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
     if decode_text(head) is not None:  # flight logs are binary
         trajectory = read_trajectory(path, track_name)

@@ -9,7 +9,7 @@ from px4fuse.readers.formats import refuse_foreign_format
 
 _SNIFF_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Kind of file and remedy by the suffixes of text files that users give instead of a flight log
+# Text files that users give instead of a flight log: suffixes, kind of file and action
 _TEXT_FILES = {
     (".csv", ".tsv", ".jsonl"): (
         "table",

@@ -1,12 +1,10 @@
 """Common functions of all readers: valid rows, time intervals, missing data."""
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.flight.model import Columns, Ekf2, FlightMode, Spans, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 
 # Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
 # larger values are from damaged bytes
@@ -17,44 +15,33 @@ MAX_IMU_VALUE = 1e4
 # Minimum distance (m) of a position 0, 0, 0 from its neighbours to reject it as not measured: 3 σ
 # of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum duration (s) of equal positions to reject them as an old position that is sent again: a
-# source that sends each position several times repeats it for a shorter time
+# Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
+# sources that send each position several times repeat it for a shorter time
 MIN_HELD_S = 1.0
-# Minimum number of equal positions to reject them as an old position that is sent again
+# Minimum number of equal positions that the source repeats instead of measuring
 MIN_HELD_COUNT = 5
-# Maximum fraction of positions that are sent again: with more, the source is at rest and may repeat
-# its position
+# Maximum fraction of repeated positions to reject them: with more, the source may be at rest
 MAX_HELD_FRACTION = 0.5
-# Maximum deviation (rounding steps) of a difference of two values from a multiple of the rounding
-# step
+# Maximum deviation of a difference from a multiple of the rounding step, in rounding steps
 MAX_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return all :class:`Unavailable` in the data of a flight, also inside :class:`Ekf2`."""
+    """Return the descriptions of all missing data of a flight, also inside :class:`Ekf2`."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusing)
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
-    """Return start (s), end (s) and value of each interval in which a time series is constant."""
-    changes = values[values.ne(values.shift())]
-    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
-    return [(start, end, value) for start, end, value in spans if end > start]
-
-
 def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
-    return tuple(
-        (start, end)
-        for start, end, is_landed in constant_spans(landed, duration_s)
-        if not is_landed
-    )
+    changes = landed[landed.ne(landed.shift())]
+    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    spans = zip(starts, [*starts[1:], duration_s], changes, strict=False)
+    return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
 
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
@@ -69,23 +56,19 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 
 
-def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Convert flight mode names over time to intervals (s) with one mode."""
-    return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
-
-
 def finite_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
-    """Return the rows with all absolute values in ``columns`` below ``limit``, without NaN."""
+    """Return the rows in which all ``columns`` are finite and absolutely smaller than ``limit``."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
 def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return "NaN", "zero" or "held" for each row that is not a measurement, and "" for the others.
+    """Return the reason for each row that is not a measurement, and "" for all others.
 
-    ``columns`` are the coordinates that a measurement needs.
+    "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "held": the
+    last position is sent again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason = pd.Series("", index=samples.index)
@@ -112,10 +95,7 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
 
 
 def rounding_step(values: Array) -> float:
-    """Return the step of which all differences of the values are multiples.
-
-    Return 0 if there is no such step.
-    """
+    """Return the quantisation step of rounded values; 0 if the values are not rounded."""
     steps = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(steps):
         return 0.0
@@ -126,20 +106,14 @@ def rounding_step(values: Array) -> float:
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
-    """Interpolate a time series at times.
-
-    The result is NaN before the first and after the last sample.
-    """
+    """Interpolate a time series at times; NaN outside its time span."""
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
 def join_nearest(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
-    """Join each row with the row of ``other_samples`` that is nearest in time.
-
-    The added columns are NaN if no row is within the tolerance.
-    """
+    """Join each row with the nearest row in time of ``other_samples``; NaN beyond the tolerance."""
     return pd.merge_asof(
         samples,
         other_samples,
@@ -151,24 +125,15 @@ def join_nearest(
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a valid quaternion ``w, x, y, z``.
-
-    A quaternion with norm 0 means that the sender sent no attitude.
-    """
+    """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Return the orientation of each sample.
+    """Return the orientation of each sample with its variances; None if it never changes.
 
-    Return None if the orientation never changes.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        Columns ``w, x, y, z`` and optionally the variances ``forward_rad2, right_rad2,
-        down_rad2``, in which 0 means "not sent" (``EKF2.cpp``).
+    A variance of 0 becomes NaN: it means "not sent" (``EKF2.cpp``).
     """
     orientation = with_attitude(
         samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)

@@ -19,23 +19,15 @@ GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of a topic or message, and the DataFrame columns to which they are converted.
+    """Fields of a topic or message, and the DataFrame columns to which they are converted."""
 
-    Attributes
-    ----------
-    topic : str
-        PX4 topic or MAVLink message; empty if another row of the table contains the name.
-    columns : mapping from column name to field name
-        Required fields; ``name[i]`` is an array element.
-    optional : mapping from column name to field name
-        Fields that are read if the topic contains them.
-    scale : mapping from column name to float
-        Factor from field value to column value; 1 if absent.
-    """
-
+    # PX4 topic or MAVLink message; empty if the table row has another key for it
     topic: str = ""
+    # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
+    # Field of each column that is read only if the topic contains it
     optional: Mapping[str, str] = field(default_factory=dict)
+    # Factor from field value to column value; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -53,14 +45,7 @@ def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand groups of columns, such as "POSITION", to one entry per column.
-
-    Parameters
-    ----------
-    fields : mapping
-        Keys are column names separated by blanks, or the name of a list in :class:`Columns`.
-        Values are field names separated by blanks, elements of one array field (``name[]`` for
-        consecutive elements from 0, or ``name[0 6 11]``), or one number for all columns.
+    """Expand groups of columns (lists of names, or a list in Columns) to one entry per column.
 
     Examples
     --------
@@ -68,6 +53,8 @@ def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     {'north_m': 'x', 'east_m': 'y', 'down_m': 'z'}
     >>> expand_columns({"north_m east_m": "position[]"})
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
+    >>> expand_columns({"north_m2 east_m2": "covariance[0 6]", "w x": 1.0})
+    {'north_m2': 'covariance[0]', 'east_m2': 'covariance[6]', 'w': 1.0, 'x': 1.0}
     """
     columns: dict[str, Any] = {}
     for column_names, field_names in fields.items():

@@ -1,4 +1,4 @@
-"""Formats of ``formats.toml``: streams of positions, and formats that px4fuse does not read."""
+"""File formats by content (``formats.toml``): position streams, and formats that are not read."""
 
 from pathlib import Path
 from typing import Any

@@ -63,13 +63,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
-    """Parse the text of a g2o file.
-
-    Parameters
-    ----------
-    name : str
-        File name for error messages.
-    """
+    """Parse the text of a g2o file with the file name ``name``."""
     rows_by_tag = _rows_by_tag(text, name)
     in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
     dimension, tag_kind, pose_width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)

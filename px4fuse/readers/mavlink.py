@@ -23,7 +23,6 @@ from px4fuse.flight.model import (
     Columns,
     Ekf2,
     Flight,
-    FlightMode,
     Spans,
     TableOrUnavailable,
     Unavailable,
@@ -95,7 +94,6 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = common.ends_in_flight(airborne, recording.duration_s)
     pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
-    modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
         # The log description is made last, because it counts the samples that the readers dropped
         log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
@@ -106,7 +104,6 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         truth=truth,
         airborne=airborne,
         barometer=barometer(pressure_altitude(pressure_hpa)),
-        modes=modes,
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, clock_mappings),
@@ -262,21 +259,6 @@ def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
     landed = pd.Series(states["landed_state"][is_known] == messages.ON_GROUND_STATE, index=time_s)
     return common.flight_spans(landed, recording.duration_s)
-
-
-def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
-    rows = recording.rows("HEARTBEAT")
-    if not len(rows):
-        return messages.NO_MODES
-    custom_modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
-    names = [
-        messages.AUTO_MODES.get(custom_mode >> 24 & 0xFF, "Auto")
-        if (main_mode := custom_mode >> 16 & 0xFF) == messages.AUTO_MAIN_MODE
-        else messages.MAIN_MODES.get(main_mode, f"mode {main_mode}")
-        for custom_mode in custom_modes.tolist()
-    ]
-    time_s = recording.receipt_boot_s(rows) - recording.zero_s
-    return common.mode_spans(pd.Series(names, index=time_s), recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:

@@ -19,23 +19,21 @@ from px4fuse.flight.log import ClockMap
 # Maximum median difference (s) between timestamps of a sender and the receive time since boot: with
 # a larger difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# Minimum reduction (s) by TIMESYNC of the difference between timestamps and receive time: with a
-# smaller reduction the sender uses the boot clock
+# Minimum time (s) by which TIMESYNC brings timestamps nearer to the receive time; with less, the
+# sender uses the boot clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
 # Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
-# Interval length (s) of the lower envelope, which uses the message with the least delay in each
-# interval
+# Length (s) of the intervals from each of which the message with the least delay is used
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
 # the same rate
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference between the rates of two clocks in real time: a link that is replayed
-# has a larger difference, which is estimated even below MIN_DRIFT_SPAN_S
+# Maximum relative difference between the rates of two real clocks. A replayed recording has a
+# larger difference, which is estimated even below MIN_DRIFT_SPAN_S
 MAX_RATE_DIFFERENCE = 0.01
-# Maximum ratio of the rates of two clocks: above any replay speed or wrong unit of time (s for ns
-# is 1e9)
+# Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
 # Minimum fraction of distinct timestamps of a running clock
@@ -68,17 +66,9 @@ class Line:
 
 
 def fit_least_delay(x: Array, y: Array) -> Line:
-    """Fit the lower envelope of pairs of clock readings: y is read after x with a varying delay.
+    """Fit a line to pairs of clock readings (s) with the least delay: y is read later than x.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (n,), s
-        Readings of the clock that is read first and of the clock that is read later; n ≥ 1.
-
-    Returns
-    -------
-    Line
-        The slope is 1 if the span is too short to estimate a drift.
+    The slope is 1 if the span is too short to estimate a drift.
     """
     order = np.argsort(x, kind="stable")
     x = x[order]
@@ -152,23 +142,14 @@ def map_clock(
 
     Parameters
     ----------
-    name : str
-        Sender, for messages.
-    stamp_s, received_s : ndarray, shape (n,)
-        Timestamps of the sender's messages, and their receive times.
     boot_of_receipt : Line
         Map from receive time to boot clock.
-    replies : tuple of ndarray, shape (n,), s
-        TIMESYNC requests of the autopilot: autopilot's clock at the request, sender's clock at the
-        reply.
-    answers : tuple of ndarray, shape (m,), s
-        TIMESYNC requests of the sender: sender's clock at the request, autopilot's clock at the
-        reply.
+    replies, answers : tuple of ndarray, s
+        TIMESYNC clock readings at request and reply: requests of the autopilot, and of the sender.
     map_boot_to_unix : Line or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
-        True if the recording contains receive times; False if it contains only the order of the
-        messages.
+        False if the recording contains only the order of the messages, no receive times.
     """
     time_source = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
@@ -211,7 +192,7 @@ def map_clock(
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
     for method, line, note in candidates:
-        # With the map of another clock, the boot times are far from the receive times
+        # TIMESYNC or SYSTEM_TIME of another clock gives boot times far from the receive times
         if distance_s(line.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
     line = fit_least_delay(stamp_s, received_s)
@@ -222,11 +203,7 @@ def map_clock(
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
-    """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions.
-
-    ``replies`` and ``answers`` are pairs of clock readings, see :func:`map_clock`. Return None if
-    both have fewer than MIN_TIMESYNC_PAIRS readings.
-    """
+    """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions."""
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
         # In a reply the autopilot's clock is read first, so the map from that clock is fitted and

@@ -18,12 +18,6 @@ AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
-AUTO_MAIN_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
-NO_MODES = Unavailable(
-    "flight modes",
-    "the recording has no HEARTBEAT of a PX4 autopilot",
-    "Record the link of a PX4 vehicle.",
-)
 ARDUPILOT_REPLAY = Unavailable(
     "estimator replay",
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
@@ -48,35 +42,31 @@ AUTOPILOT_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionInput:
-    """Message that sends an external position to the autopilot.
+    """Message that sends an external position to the autopilot."""
 
-    ``name`` is the track name for ``--position-source``, ``row`` the key in LAYOUTS, ``stamp`` the
-    field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any.
-    ``drops_covariance`` is True for a naive estimator, because PX4 ignores the covariance in its
-    message (``mavlink_receiver.cpp``).
-    """
-
+    # Key of the message in LAYOUTS
     row: str
     description: str
+    # Name of the track for ``--position-source``
     name: str = ""
     kind: str = "uwb"
+    # Field with the sender's time (µs)
     stamp: str = "time_usec"
+    # Required MAV_ESTIMATOR_TYPE, if any
     estimator: int | None = None
+    # True for a naive estimator: PX4 ignores its covariance (mavlink_receiver.cpp)
     drops_covariance: bool = False
 
     @property
     def layout(self) -> Layout:
-        """Fields of the message and the DataFrame columns to which they are converted."""
         return LAYOUTS[self.row]
 
     @property
     def origin(self) -> Origin:
-        """Kind of the position source, and data path of the positions from sender to log."""
         return find_origin(self.kind, "as received")
 
     @property
     def message(self) -> str:
-        """MAVLink name of the message."""
         return self.layout.topic
 
 
@@ -94,10 +84,7 @@ _TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
-AUTOPILOTS, MAIN_MODES, AUTO_MODES = (
-    msgspec.convert(_TABLE[name], dict[int, str], strict=False)
-    for name in ("autopilots", "main_modes", "auto_modes")
-)
+AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)
 UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))

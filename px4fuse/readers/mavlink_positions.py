@@ -71,10 +71,7 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions in one message type from one sender.
-
-    Return None if the sender sent no such message.
-    """
+    """Read the positions in one message type from one sender, if it sent such messages."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -120,9 +117,7 @@ def _read_gnss(
 ) -> PositionTrack | Unavailable | None:
     """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
 
-    PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
-    next one. px4fuse selects GNSS by default only if the autopilot sends a global position. Return
-    None without messages.
+    The autopilot repeats each fix until the next one. Return None without messages.
     """
     rows = recording.rows(layout.topic)
     count = len(rows)

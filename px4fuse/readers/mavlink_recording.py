@@ -33,8 +33,7 @@ RESTART_CHECK_MESSAGES = 20
 # Minimum size of a group of timestamps between two gaps, as fraction of the largest group: smaller
 # groups are damaged timestamps
 MIN_GROUP_FRACTION = 0.01
-# Maximum interval (s) between valid timestamps, and maximum distance (s) of valid timestamps from
-# the analysed session
+# Maximum distance (s) of a valid timestamp from the analysed session, or from the next timestamp
 MAX_OUTSIDE_S = 60.0
 # Maximum fraction of bytes outside of MAVLink frames in a file without damage
 MAX_LOST_FRACTION = 0.002
@@ -44,46 +43,29 @@ MIN_CONSTANT_TIMESTAMPS = 10
 
 @dataclass(frozen=True)
 class Recording:
-    """MAVLink recording with the map from receive time to the autopilot's boot clock.
-
-    Attributes
-    ----------
-    frames : Frames
-    address : Address
-        Address of the autopilot of this flight.
-    session : slice
-        Analysed frames: the longest part of the recording between two restarts of the autopilot.
-    received_s : ndarray, shape (n,)
-        Receive time (s) of every frame since the first frame. In a stream without receive times:
-        boot time of the last autopilot message before the frame.
-    boot_of_receipt : Line
-        Map from receive time (s) to boot clock (s).
-    zero_s, duration_s : float
-        Boot time (s) at the start of the session, and duration of the session. Times of the flight
-        count from ``zero_s``.
-    damage : tuple of str
-        Sentences on unreadable parts of the file.
-    notes : list of str
-    restarts, receive_time_reversals : int or None
-        See :class:`~px4fuse.flight.log.LogInfo`.
-    dropped : dict
-        Number of samples with an invalid timestamp, by message; filled by :meth:`read`.
-    streams : dict
-        Messages and clock of each kind of data in the flight; filled by :meth:`record_stream`.
-    """
+    """MAVLink recording with the map from receive time to the autopilot's boot clock."""
 
     frames: Frames
+    # Address of the autopilot of this flight
     address: Address
+    # Analysed frames: the longest part of the recording between two restarts of the autopilot
     session: slice
+    # Receive time of each frame since the first frame. In a stream without receive times: boot time
+    # of the last autopilot message before the frame
     received_s: Array
+    # Map from receive time to boot clock
     boot_of_receipt: Line
+    # Boot time at the start of the session, which is time zero of the flight
     zero_s: float
     duration_s: float
     notes: list[str]
+    # Sentences on unreadable parts of the file
     damage: tuple[str, ...] = ()
     restarts: int | None = None
     receive_time_reversals: int | None = None
+    # Number of samples with an invalid timestamp, by message
     dropped: dict[str, int] = field(default_factory=dict)
+    # Messages and clock of each kind of data in the flight
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
@@ -92,10 +74,7 @@ class Recording:
         return np.asarray(rows[(rows >= self.session.start) & (rows < self.session.stop)])
 
     def rows(self, message: str, address: Address | None = None) -> IntArray:
-        """Return the frame indices of one message within the session from one sender.
-
-        The default sender is the autopilot.
-        """
+        """Return the frame indices of one message from one sender (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
         return np.asarray(rows[self.frames.sent_by(address or self.address, rows)])
 
@@ -165,10 +144,7 @@ class Recording:
         return self.boot_of_receipt.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the time since boot (s) of autopilot messages.
-
-        Messages without timestamp have their receive time.
-        """
+        """Return the time since boot (s) of autopilot messages, else their receive time."""
         if not self.boot_of_receipt.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
@@ -351,10 +327,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 
 def map_boot_to_unix(recording: Recording) -> Line | None:
-    """Map the boot clock to UNIX time by SYSTEM_TIME.
-
-    Return None if SYSTEM_TIME contains no UNIX time.
-    """
+    """Map the boot clock to UNIX time by SYSTEM_TIME, if it contains UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     boot_s = table["time_boot_ms"] * 1e-3
     unix_s = table["time_unix_usec"] * 1e-6

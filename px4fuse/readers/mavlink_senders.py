@@ -26,7 +26,8 @@ MAX_SENDERS = 32
 MAX_LOST_FRACTION = 0.9
 # Maximum lateness (sequence numbers) of a message that was received over a slower link
 MAX_LATE_MESSAGES = 16
-# Maximum difference (s) between timestamps of one clock
+# Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: with a larger
+# one they are from another clock
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
@@ -95,7 +96,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of a message, except autopilots of this and other vehicles."""
+    """Return the senders of a message that are not autopilots, such as companion computers."""
     frames = recording.frames
     own_address = recording.address
     other_vehicles = {
@@ -135,7 +136,7 @@ def _map_sender_clock(
     is_reply = (reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
-    # Requests are sent at their timestamp, so their timestamps have a small delay and are used, too
+    # TIMESYNC requests are sent without delay after their timestamp, so they improve the clock map
     is_request = (
         has_running_clock
         & (reply_s == 0.0)
@@ -181,8 +182,8 @@ def clock_maps(
         note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = (
-                "estimated from the messages with the least delay, and used only to order messages "
-                "and to map clocks"
+                "this map is estimated from the messages with the least delay, and only orders "
+                "messages and maps other clocks"
             )
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         name = "receive time (UNIX time of the recording computer)"

@@ -44,24 +44,21 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum number of tags in a file: more values are a running number
+# Maximum number of tags in a column: a column with more values contains a running number
 MAX_TAGS = 100
 MIN_ROWS = 3
-# Minimum fraction of usable rows of a table without header, and of whole seconds in a column beside
-# nanoseconds: fewer rows show that the columns have another meaning
+# Minimum fraction of rows that agree with the assumed meaning of a column
 MIN_USABLE_SHARE = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Units of times that are not UNIX time, and plausible median intervals (s), by is_trajectory: key
-# frames may have minutes between them, and ORB-SLAM3 writes nanoseconds
-PLAUSIBLE_TIMES = {
-    False: (tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)),
-    True: (("s", "ns"), (1e-3, 1e3)),
-}
-# Maximum median interval (s) of timestamps in UNIX time: boot times in µs can be equally large
-# numbers, but they have larger intervals
+# Plausible units of positions and trajectories, and range of their median interval (s): key frames
+# may have minutes between them
+POSITION_TIMES = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
+TRAJECTORY_TIMES = ("s", "ns"), (1e-3, 1e3)
+# Maximum median interval (s) of UNIX times: boot times in µs may be equally large numbers, but as
+# UNIX times they would have larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
 MAX_INDOOR_EXTENT_M = 200.0
@@ -71,58 +68,35 @@ MAX_COORDINATE = 1e9
 
 @dataclass(frozen=True)
 class PositionRecording:
-    """Content of a position file, in the clock and frame of the file.
-
-    Attributes
-    ----------
-    name : str
-        File name without folder.
-    sha256 : str
-        SHA-256 hash of the file.
-    size_bytes : int
-    samples : DataFrame, shape (n, 6)
-        ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m); NaN if not in the file. The index
-        ``time_s`` (s, clock of the file) is strictly increasing. In frame "ned" x is north, y
-        east, z down; in "enu" x is east, y north, z up. The order of columns in the file does not
-        matter.
-    clock : "UNIX" or "local"
-        "UNIX" if the timestamps are between 2000 and 2100.
-    frames : tuple of str
-        Frames that column names or format allow, such as ("ned",); empty if they contain none.
-    detected : tuple of str
-        Sentences about the detected format: one for each property, such as unit or frame.
-    notes : tuple of str
-        Number of dropped rows with the reason, and warnings.
-    dropped : int
-        Number of rows with an invalid timestamp.
-    metres_per_unit : float
-        Factor that was applied to the first position column.
-    invalid : Series
-        Rows without a measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
-    step_m : float
-        Rounding step of the coarsest horizontal coordinate; 0 if there is none.
-    format : str
-        Name of the format; "" for a table with a header.
-    row_count : int
-        Number of rows of the body in the file.
-    quaternions : ndarray or None
-        Orientation of each sample (x, y, z, w), shape (n, 4).
-    """
+    """Content of a position file, in the clock and frame of the file."""
 
     name: str
     sha256: str
     size_bytes: int
+    # Columns SAMPLE_COLUMNS; NaN if not in the file. Times are strictly increasing. In frame "ned"
+    # x is north, y east, z down; in "enu" x is east, y north, z up
     samples: pd.DataFrame
+    # "UNIX" if the timestamps are between 2000 and 2100
     clock: Literal["UNIX", "local"]
+    # Frames that the column names or the format allow; empty for all
     frames: tuple[str, ...]
+    # Sentences about the detected format, such as unit or frame
     detected: tuple[str, ...]
+    # Sentences about dropped rows and warnings
     notes: tuple[str, ...]
+    # Number of rows with an invalid timestamp
     dropped: int = 0
+    # Factor that was applied to the positions
     metres_per_unit: float = 1.0
+    # Reason for each row that is not a measurement, see :func:`find_invalid`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
+    # Rounding step of the coarsest horizontal coordinate; 0 if there is none
     step_m: float = 0.0
+    # Name of the format; "" for a table with a header
     format: str = ""
+    # Number of rows of the body in the file
     row_count: int = 0
+    # Orientation of each sample (x, y, z, w)
     quaternions: Array | None = None
 
 
@@ -155,7 +129,7 @@ def read_position_file(
     body : str, optional
         Body or tag in the file, or topic of a ROS bag.
     is_trajectory : bool
-        True to accept a large extent as metres, and to keep zeros and constant positions.
+        True for a trajectory: its extent may be large, and zeros are valid positions.
 
     Raises
     ------
@@ -192,11 +166,12 @@ def read_position_file(
     numbers = numbers[is_usable]
     times = numbers[time].to_numpy()
     name_unit = meanings[time].unit if meanings[time].unit in TIME_UNITS else ""
-    units, intervals_s = PLAUSIBLE_TIMES[is_trajectory]
+    units, intervals_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
     unit, unit_text = _time_unit(times, name_unit, time_unit, units, intervals_s)
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
     if table.rate_hz is not None:
-        units_per_second, unit_text = table.rate_hz, f"frames at {table.rate_hz:g} Hz"
+        unit_text = f"the frame rate is {table.rate_hz:g} Hz"
+        unit, units_per_second = "frame numbers", table.rate_hz
     seconds = times / units_per_second
     kept_rows = _increasing_rows(seconds)
     if dropped := len(seconds) - len(kept_rows):
@@ -218,9 +193,8 @@ def read_position_file(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
-    max_extent_m = np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
     scale_by_column, length_unit_text = _length_units(
-        numbers, axes, meanings, length_unit, max_extent_m
+        numbers, axes, meanings, length_unit, np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
     )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
@@ -250,7 +224,7 @@ def read_position_file(
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
-            f"time: column {time_text}, {clock} clock, unit {unit_text}",
+            f"time: column {time_text}, {clock} clock, unit {unit} ({unit_text})",
             f"position: columns {table.label(*position)} as {axes_text}, unit {length_unit_text}",
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
@@ -362,7 +336,9 @@ def _select_body(
             if 1 < len(tags) <= MAX_TAGS or (tags and body is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body)]
     if body is not None and not table.is_one_body:
-        raise LogError(f"{table.file_name} contains one body, without a name", "Omit its name.")
+        raise LogError(
+            f"{table.file_name} contains one body, without a name", "Omit the name of the body."
+        )
     return texts
 
 
@@ -390,11 +366,9 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma.
+    """Choose the columns of time, position and sigma; return also the frame and a text on time.
 
-    Also return the frame, and the description of the time column. Columns that the user chose are
-    used. Otherwise the column names determine the columns. A column with the time of measurement is
-    preferred to a column with the time of recording if it is not empty.
+    The time of measurement is preferred to the time of recording.
     """
     if chosen_columns:
         time = chosen_columns[0]
@@ -448,39 +422,35 @@ def _time_unit(
     units: Container[str],
     intervals_s: tuple[float, float],
 ) -> tuple[str, str]:
-    """Return the unit of the time column, and a text with the reason for this unit.
+    """Return the unit of the time column, and the reason for this unit.
 
-    Units other than ``units`` are for UNIX times only; ``intervals_s`` are the plausible median
-    intervals.
+    ``units`` and ``intervals_s`` are plausible units and median intervals of times that are not
+    UNIX times.
     """
     if option is not None:
-        return option, f"{option} (given with --position-time-unit)"
+        return option, "the unit was given with --position-time-unit"
     median = float(np.median(times)) if len(times) else 0.0
     if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
-        return name_unit, f"{name_unit} (from the column name)"
+        return name_unit, "the column name contains the unit"
     steps = np.diff(times)
     median_step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     plausible_units = []
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, f"{unit} (because the times are then UNIX times)"
+            return unit, "with this unit the times are UNIX times"
         if unit in units and intervals_s[0] <= median_step * scale <= intervals_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s (assumed, because no unit gives a plausible UWB rate; set another unit with "
-            "--position-time-unit)"
+            "px4fuse assumes this unit, because no unit gives a plausible UWB rate; set another "
+            "unit with --position-time-unit"
         )
-    unit = plausible_units[0]
-    description = (
-        f"{unit} (because the median interval is then {median_step * TIME_UNITS[unit]:.3g} s)"
-    )
-    if plausible_units[1:]:
-        description = (
-            f"{description}; if the unit is {plausible_units[1]}, give --position-time-unit"
-        )
-    return unit, description
+    unit, *others = plausible_units
+    reason = f"with this unit the median interval is {median_step * TIME_UNITS[unit]:.3g} s"
+    if others:
+        reason += f"; if the unit is {others[0]}, give --position-time-unit"
+    return unit, reason
 
 
 def _length_units(
@@ -500,14 +470,14 @@ def _length_units(
     extents = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
-    reason = "assumed, because the column names contain no unit"
+    reason = "px4fuse assumes this unit, because the column names contain no unit"
     if option is not None:
         unit = option
         name_units = {}
         reason = "the unit was given with --position-unit"
     elif axis_units := [name_units[index] for index in axes if index in name_units]:
         unit = axis_units[0]
-        reason = "from the column names"
+        reason = "the column names contain the unit"
     elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
@@ -516,8 +486,8 @@ def _length_units(
         )
     elif max_extent > max_extent_m:
         reason = (
-            "assumed, because no unit gives the extent of an indoor flight; set another unit with "
-            "--position-unit"
+            "px4fuse assumes this unit, because no unit gives the extent of an indoor flight; set "
+            "another unit with --position-unit"
         )
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}

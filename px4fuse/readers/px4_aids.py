@@ -35,17 +35,15 @@ OPTIONAL_FIELDS = {
 def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     """Read all aiding sources with innovations in the log, by PX4 name.
 
-    ``enabled_aids`` is the result of :func:`read_enabled_aids`. A topic ``estimator_aid_src_...``
-    is preferred: it contains each fusion attempt with time and result. The older topics that are
-    common to all aiding sources repeat each value until the next fusion. Repeated values are
-    removed.
+    A topic ``estimator_aid_src_...`` contains each fusion attempt. Older topics contain all aiding
+    sources, and repeat each value until the next fusion.
     """
     logs = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled_aids.get(name)
         log = _read_aid_topic(topics, aid, aid_enabled)
-        # While EKF2 does not fuse an aid, the common topics contain its old values or the values of
-        # other aids
+        # While EKF2 does not fuse an aiding source, the older topics contain its old values, or
+        # values of other sources
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
             log = _read_common_topics(topics, aid, aid_enabled)
         if log is not None:
@@ -150,11 +148,8 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _unjudged_times(innovation: pd.Series, variance: pd.Series) -> Array:
-    """Return the times (s) of rows that do not show an aid as not fused.
-
-    An innovation of 0 means that EKF2 had no sample in this row. A variance that changes shows
-    fusion, even if the innovation in the log is old.
-    """
+    # An innovation of 0 means that EKF2 had no sample. A variance that changes shows fusion, even
+    # if the logged innovation is old
     is_changed = (variance > 0.0) & variance.ne(variance.shift())
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
@@ -171,10 +166,9 @@ def _make_aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Build the log of an aiding source from the rows with positive innovation variance.
+    """Make the record of an aiding source from the rows with positive innovation variance.
 
-    Return None without such rows. Innovations are negated, because PX4 logs predicted minus
-    measured.
+    Innovations are negated, because PX4 logs predicted minus measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:

@@ -40,8 +40,8 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum deviation (IMU samples) of the prediction interval from n + 0.5 IMU samples for which EKF2
-# may round to n or to n + 1
+# Maximum distance of a number of IMU samples per prediction from n + 0.5, for which EKF2 may round
+# up or down
 MAX_HALF_DISTANCE = 0.05
 # Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
 # between them
@@ -195,14 +195,14 @@ def configured_step_s(topics: Topics) -> float:
 
 
 def _step_s(topics: Topics) -> float:
-    """Return the actual prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
+    """Return the prediction interval (s), a whole number of IMU intervals (ImuDownSampler.cpp)."""
     configured_s = configured_step_s(topics)
     imu_s = topics.read(px4.IMU).index.to_numpy()
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
         return configured_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
     end_rows = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
-    # in IMU intervals, because the logger may have dropped IMU samples
+    # time differences are used instead of row numbers, because IMU samples may be missing
     step_ends = np.rint((imu_s[end_rows] - imu_s[0]) / interval_s)
     return samples_per_step(configured_s, interval_s, step_ends) * interval_s
 
@@ -362,10 +362,9 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 
 
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the magnetic field, either from the magnetometer or from EKF2's observation.
+    """Read the magnetic field from the magnetometer or from EKF2's observations.
 
-    A topic with all samples that EKF2 uses is preferred, then a topic with EKF2's low-pass filtered
-    innovation.
+    A topic with all samples is preferred, else one with EKF2's low-pass filtered innovations.
     """
     candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETOMETER]
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
@@ -384,7 +383,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Compute the mean flow velocity between consecutive rows of EKF2's low-pass filtered flow."""
+    """Undo EKF2's low-pass filter of optical flow; return the mean velocity of each interval."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")

@@ -1,4 +1,4 @@
-"""Innovations of a position source along each axis, from EKF2's logged aids."""
+"""Innovations of a position source along each axis, from EKF2's aiding sources."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ Innovations = dict[AxisName, TableOrUnavailable]
 
 @dataclass(frozen=True)
 class Ekf2Source:
-    """Position source as which EKF2 fuses positions, with the names of its aiding sources in PX4.
-
-    ``height`` is the name of a separate height sensor; it is empty if the source also gives the
-    height. ``remedies`` are the actions to enable fusion, and ``to_log`` is the action to log it.
-    """
+    """Position source of EKF2: external vision or GNSS, with its aiding sources."""
 
     name: str
+    # PX4's names of the aiding sources for horizontal position and height
     horizontal: str
     vertical: str
+    # Actions to enable the fusion of horizontal position and height
     remedies: Mapping[str, str]
+    # Action to log the innovations
     to_log: str
+    # Name of a separate height sensor, if any
     height: str = ""
 
 
@@ -130,9 +130,9 @@ def innovations_by_axis(
 
 
 def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
-    """Return the fused and rejected innovations of an aid along one axis.
+    """Return the fused and rejected innovations of an aiding source along one axis.
 
-    EKF2 rejects all axes of an aid together, so each axis has the rejections of the whole aid.
+    EKF2 rejects all axes of a sample together.
     """
     samples = log.samples
     nis = {

@@ -35,7 +35,7 @@ from px4fuse.readers.common import (
 )
 from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import configured_step_s
-from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
+from px4fuse.readers.px4_fixes import read_unlogged_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
@@ -43,7 +43,7 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# Maximum delay (µs) from timestamp to publication for which the timestamp is the arrival time
+# Maximum delay (µs) from timestamp to publication of a message with its arrival time as timestamp
 MAX_ARRIVAL_DELAY_US = 100
 # Minimum fraction of arrival times among the timestamps of a topic to report that the topic has no
 # measurement times
@@ -84,7 +84,7 @@ def read_positions(
 def split_tracks(
     tracks: list[PositionTrack | Unavailable],
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Return the position tracks, best first, and the reasons for missing tracks."""
+    """Separate the position tracks, best first, from the reasons for missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
     available_tracks.sort(key=lambda track: track.origin.preference)
     return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
@@ -105,9 +105,7 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track from valid samples.
-
-    The result is Unavailable with fewer than three valid samples.
+    """Make a position track from the valid samples, of which three are needed.
 
     Parameters
     ----------
@@ -178,7 +176,7 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # the field contains the frame before EKF2 rotated the positions to NED
+        frame = "NED"  # EKF2 rotated the positions, but the field still contains the old frame
     if "published_us" in samples:
         published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
         samples["age_s"] = published_s - samples.index
@@ -196,11 +194,10 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic whose timestamps are not measurement times.
+    """Describe the clock of a topic whose timestamps are not measurement times, else return None.
 
     PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
-    uses the arrival time if ``timestamp_sample`` is not boot time in microseconds. Return None if
-    the timestamps are measurement times.
+    uses the arrival time if ``timestamp_sample`` is not boot time in microseconds.
     """
     table = topics.of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -318,7 +315,7 @@ def _reconstruct(
         turns=turns,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
-        clock=f"innovation time plus {EV_POS.delay}, late by up to one interval of the source",
+        clock=f"time of the innovation plus {EV_POS.delay}, up to one sample interval late",
     )
 
 
@@ -436,11 +433,6 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)"
         )
-    elif rate_hz < MAX_DOWNSAMPLED_HZ:
-        reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
-        if note:
-            samples = pd.concat([samples, reconstructed_fixes]).sort_index()
-            notes.append(note)
     track_fields: dict[str, Any] = {}
     # the lever arm of each receiver is logged since v1.17
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):
@@ -520,11 +512,9 @@ def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Return motion capture as ground truth if the log also contains external vision.
+    """Return motion capture as ground truth, if the log also contains external vision.
 
-    Otherwise return None.
-
-    Otherwise EKF2 may have fused motion capture, and the result is None.
+    Without external vision, EKF2 may have fused motion capture.
     """
     track = next((track for track in positions if track.topics[0] == topic), None)
     if track is None or not any(track.origin.is_vision for track in positions):

@@ -20,21 +20,19 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Position track that a ULog may contain. The key in TRACKS is the ``--position-source`` name.
+    """Position track that a ULog may contain, by the name for ``--position-source`` in TRACKS."""
 
-    ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the track,
-    and ``layouts`` are the possible fields of the topic of the track; empty without a topic.
-    """
-
+    # Kind of the position source, and path of its positions to the log, see Origin
     kind: str
     path: str
     description: str
+    # Action to log the track
     remedy: str
+    # Keys of the possible layouts of its topic; empty without a topic
     layouts: tuple[str, ...] = ()
 
     @property
     def origin(self) -> Origin:
-        """Kind of the position source, and data path of the positions from sender to log."""
         return find_origin(self.kind, self.path)
 
 
@@ -42,7 +40,6 @@ _TABLE = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
-NAV_STATES = msgspec.convert(_TABLE["nav_states"], dict[int, str], strict=False)
 UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
@@ -52,9 +49,8 @@ DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
 MAGNETOMETER = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
-# Number of attitude variances by the array lengths of states and variances in the log. 4: filter
-# with quaternion states, with biases as increments per prediction. 3: error-state filter
-# (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
+# Number of attitude variances, by the lengths of the logged arrays of states and variances: 4 for a
+# filter with quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
 ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
@@ -70,13 +66,12 @@ GPS_POSITION = "vehicle_gps_position"
 # Tracks of external vision and motion capture that have a separate topic
 SOURCE_TRACKS = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
-# Aids with a flag "fused" that is always set in v1.15 and v1.16; the control bit is used instead
+# Aiding sources whose flag "fused" is always set in v1.15 and v1.16, so it is not used
 FLAG_ALWAYS_SET = ("gravity", "drag")
-# Aids that log a local position as observation (the GNSS observation is latitude and longitude)
+# Aiding sources with a local position as logged observation (GNSS has latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
-# Topics with the innovations, and with the innovation variances, of all aids; before v1.12 one
-# topic contains both
+# Topics with the innovations and the innovation variances of all aiding sources (since v1.12)
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
 

@@ -38,37 +38,22 @@ _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 @dataclass(frozen=True)
 class Table:
-    """Table in a recording.
-
-    Attributes
-    ----------
-    file_name : str
-    format : str
-        Name of the format; "" for a table with a header.
-    names : list of str
-        Column names.
-    body : str
-        Text of the lines below the header.
-    separator : str
-    header_line : int or None
-        Line number of the header; 0 without a header, None if rows are not lines of the file.
-    frames : tuple of str
-        Frames that the format may have; empty for all.
-    rate_hz : float or None
-        Rate of the frame numbers that are in the time column; None for times.
-    is_one_body : bool
-        True if the columns belong to one body that was chosen from several.
-    notes : tuple of str
-    """
+    """Table of positions in a recording."""
 
     file_name: str
+    # Name of the format; "" for a table with a header
     format: str
     names: list[str]
+    # Text of the lines below the header
     body: str
     separator: str = ","
+    # Line number of the header; 0 without a header, None if rows are not lines of the file
     header_line: int | None = None
+    # Frames that the format may have; empty for all
     frames: tuple[str, ...] = ()
+    # Rate of the frame numbers in the time column; None for times
     rate_hz: float | None = None
+    # True if the columns belong to one body that was chosen from several
     is_one_body: bool = False
     notes: tuple[str, ...] = ()
 
@@ -127,7 +112,7 @@ def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) 
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose one with --body."
+        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose a body with --body."
     )
 
 
@@ -191,7 +176,7 @@ def find_table(
 
 
 def _is_complete(line: str, line_before: str) -> bool:
-    """Return True if a line without line end has the columns and decimals of the one before."""
+    """Return True if the last line has as many columns and decimals as the line before."""
     cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
     decimals, decimals_before = (one[-1].partition(".")[2] for one in (cells, cells_before))
     return "." in line and len(cells) == len(cells_before) and len(decimals) >= len(decimals_before)
@@ -271,14 +256,14 @@ def _find_groups(
 
 
 def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
-    """Convert the lines of a stream that contain a position."""
+    """Convert the positions of a known stream format to a table."""
     for stream in STREAMS:
         pattern = re.compile(stream["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
         if first_row is not None:
             rows = pattern.findall(text)
             range_count = len(re.findall(stream["ranges"], first_row))
-            notes = [f"not used: {range_count} ranges beside each position"]
+            notes = [f"the {range_count} ranges beside each position are not used"]
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
             body = "".join(f"{','.join(row)}\n" for row in rows)
@@ -287,13 +272,15 @@ def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | Non
 
 
 def _find_json(file_name: str, text: str) -> Table | None:
-    """Convert JSON lines; names are the paths of the values, such as ``data.coordinates.x``."""
+    """Convert JSON lines to a table; column names are paths such as ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
     try:
         values = msgspec.json.Decoder().decode_lines(text)
     except msgspec.DecodeError as error:
-        raise LogError(f"{file_name} contains invalid JSON ({error})", "Record it again.") from None
+        raise LogError(
+            f"{file_name} contains invalid JSON ({error})", "Record the positions again."
+        ) from None
     records = [
         record for value in values for record in (value if isinstance(value, list) else [value])
     ]
@@ -339,7 +326,7 @@ def _without_comments(text: str) -> str:
 
 
 def _kitti_table(path: Path, text: str) -> Table:
-    """Read the rows of 3x4 matrices, and the times from a file in the same folder."""
+    """Read KITTI poses (rows of 3x4 matrices), and their times from a file in the same folder."""
     # imported on demand, as most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
@@ -359,7 +346,7 @@ def _kitti_table(path: Path, text: str) -> Table:
     except ValueError as error:
         raise LogError(
             f"{name}: the KITTI poses or the times in {display_name(times_path)} are not valid",
-            "Export both again.",
+            "Export poses and times again.",
         ) from error
     names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     note = f"the times are from {display_name(times_path)}"

@@ -122,7 +122,7 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     if chosen not in usable:
         raise LogError(
             f"{name} contains these topics with positions: {', '.join(usable) or 'none'}",
-            f"Give one as {name}:TOPIC." if usable else "Record the positions as PoseStamped.",
+            f"Give {name}:TOPIC." if usable else "Record the positions as PoseStamped.",
         )
     kind = type_by_topic[chosen]
     messages = reader.messages([one for one in reader.connections if one.topic == chosen])

@@ -7,10 +7,8 @@ from msgspec import structs
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.log import UnusedData
 from px4fuse.flight.model import (
-    MODES_NOT_LOGGED,
     Columns,
     Flight,
-    FlightMode,
     Spans,
     TableOrUnavailable,
     Truth,
@@ -74,7 +72,6 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        modes=_read_modes(topics),
         tumble_spans=common.flight_spans(tilt_failures.max(axis=1) == 0.0, topics.log.duration_s),
         barometer=barometer(altitude_m, delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
@@ -118,10 +115,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples, and record their topic as stream.
-
-    The result is Unavailable if the log contains fewer than two samples.
-    """
+    """Return the samples, or the reason why too few are in the log."""
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)
@@ -153,11 +147,3 @@ def _read_airborne(topics: Topics) -> Spans | Unavailable:
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)
-
-
-def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    states = topics.read(px4.LAYOUTS["flight_mode"], step=True)["nav_state"].dropna()
-    if states.empty:
-        return MODES_NOT_LOGGED
-    names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
-    return common.mode_spans(names, topics.log.duration_s)

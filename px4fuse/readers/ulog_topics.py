@@ -90,14 +90,9 @@ class _Content(io.BytesIO):
 
     pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
     byte, or to the next synchronisation message.
-
-    Attributes
-    ----------
-    skipped_bytes : int
-    start, end, position : int
-        Offsets of the last message header, of the end of the last read, and of the next read.
-        ``end`` and ``position`` may be after the end of the file.
     """
+
+    # offsets of the last message header, the end of the last read, and the next read
 
     skipped_bytes = start = end = position = 0
 
@@ -177,39 +172,24 @@ class _Reader(ULog):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Topics:
-    """Decoded topics of one log.
+    """Decoded topics of one log."""
 
-    Attributes
-    ----------
-    log : LogInfo
-        Log description, without notes on single topics (see :attr:`dropped`).
-    tables : mapping from (topic, instance) to mapping from PX4 field name to array
-    zero_us : int
-        Boot time (µs) at flight time zero.
-    dropped : dict
-        Number of samples with an invalid timestamp, by topic and instance; filled by
-        :meth:`read_instance`.
-    ekf2_parameters : mapping
-        All EKF2_ parameters at take-off, with PX4 names; ``log`` contains only the parameters in
-        the results.
-    is_cut : bool
-        True if the file ends within a message.
-    is_damaged : bool
-        True if pyulog skipped invalid bytes or messages.
-    streams : dict
-        Topics and clock of each kind of data in the flight; filled by :meth:`record_stream`.
-    parameter_changes : tuple of ParameterChange
-        Changes of EKF2_ parameters after take-off.
-    """
-
+    # Description of the log, without notes on single topics
     log: LogInfo
     tables: Tables
+    # Boot time (µs) at flight time zero
     zero_us: int
+    # Number of samples with an invalid timestamp, by topic and instance
     dropped: dict[tuple[str, int], int]
+    # All EKF2_ parameters at take-off; ``log`` contains only those in the results
     ekf2_parameters: Mapping[str, float]
+    # True if the file ends within a message
     is_cut: bool
+    # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
+    # Topics and clock of each kind of data in the flight
     streams: dict[str, Stream] = field(default_factory=dict)
+    # Changes of EKF2_ parameters after take-off
     parameter_changes: tuple[ParameterChange, ...] = ()
 
     def instances(self, topic: str) -> list[int]:
@@ -234,10 +214,7 @@ class Topics:
         )
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are all in the log.
-
-        Return None if there is no such layout.
-        """
+        """Return the first layout whose required fields are all in the log, if any."""
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
@@ -292,10 +269,7 @@ class Topics:
         )
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout whose fields are in the log, see :meth:`read_instance`.
-
-        Return an empty table if there is no such layout.
-        """
+        """Read the first layout whose fields are in the log, else return an empty table."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
 

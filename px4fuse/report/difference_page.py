@@ -151,7 +151,6 @@ def _draw_axis(
         _time_sentence(explanation),
         TIME_HEIGHT,
         axis=name,
-        with_mode_names=True,
     )
     position_difference, remainder = (
         pd.Series(values, explanation.times_s)

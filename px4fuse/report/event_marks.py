@@ -1,4 +1,4 @@
-"""Events drawn on all time axes: gaps, flight modes, resets, rejections, outliers."""
+"""Events drawn on all time axes: gaps, resets, rejections, outliers."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,7 +11,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import (
     EKF2_REJECTED,
-    MUTED_COLOUR,
     Artist,
     Axes,
     dot_style,
@@ -20,17 +19,13 @@ from px4fuse.report.style import (
 
 # Bands differ in shade and hatching, so they remain distinct in greyscale
 _FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
-GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
-    {"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8", "#f6f0e2")
-)
+GROUND_BAND, DROPOUT_BAND = ({"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8"))
 GAP_BAND = _FILLED | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
 RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
 OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
 TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
-MODE_NAMES_HEIGHT = 12.0  # height (points) above the axes for the names of flight modes
 # Minimum time between two drawn markers, as a fraction of the segment
 MIN_MARK_DISTANCE = 1.0 / 300.0
-MODE_LETTER_WIDTH = 5.0  # mean width (points) of a letter of a flight mode's name
 
 
 class Mark(NamedTuple):
@@ -44,9 +39,7 @@ class Mark(NamedTuple):
 
 def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
     events = analysis.events
-    modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     return (
-        Mark("flight modes (alternating)", modes[1::2], MODE_BAND),
         Mark("on the ground", events.ground, GROUND_BAND),
         Mark("gap in position source", events.gaps, GAP_BAND),
         Mark("log dropout", events.dropouts, DROPOUT_BAND),
@@ -58,10 +51,8 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
     )
 
 
-def draw_marks(
-    axes: Axes, analysis: Analysis, *, axis: str | None = None, with_mode_names: bool = False
-) -> None:
-    """Draw gaps, flight modes, resets, rejections and outliers, and limit the time axis.
+def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
+    """Draw gaps, resets, rejections and outliers, and limit the time axis.
 
     Parameters
     ----------
@@ -70,8 +61,6 @@ def draw_marks(
     analysis : Analysis
     axis : str, optional
         Axis of the rejections to mark, by default the main axis; "" for none.
-    with_mode_names : bool
-        Write the names of the flight modes above the axes.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -94,8 +83,6 @@ def draw_marks(
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
             markers = Line2D(times, np.full(len(times), height), **mark_style)
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
-    if with_mode_names:
-        _draw_mode_names(axes, analysis)
 
 
 def panel(
@@ -107,7 +94,6 @@ def panel(
     *,
     above: float = 4.0,
     axis: str | None = None,
-    with_mode_names: bool = False,
     with_time_label: bool = True,
 ) -> Axes:
     """Add a plot over time with the events of :func:`draw_marks`.
@@ -117,11 +103,8 @@ def panel(
     with_time_label : bool
         False if a plot below this one has the label of the time axis.
     """
-    with_mode_names = with_mode_names and bool(analysis.events.modes)
-    axes = page.panel(
-        title, caption, height, above=max(above, MODE_NAMES_HEIGHT if with_mode_names else 0.0)
-    )
-    draw_marks(axes, analysis, axis=axis, with_mode_names=with_mode_names)
+    axes = page.panel(title, caption, height, above=above)
+    draw_marks(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
     return axes
 
@@ -156,22 +139,3 @@ def visible_times(times: Any, min_interval_s: float) -> Array:
     values = np.asarray(times, dtype=np.float64)
     visible_s: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
     return visible_s
-
-
-def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
-    """Write the name of each flight mode above the axes if the mode is long enough."""
-    low, high = axes.get_xlim()
-    width = 72.0 * axes.bbox.width / axes.figure.dpi
-    for mode in analysis.events.modes:
-        start, end = max(mode.start_s, low), min(mode.end_s, high)
-        if (end - start) / (high - low) * width >= MODE_LETTER_WIDTH * len(mode.name):
-            axes.text(
-                (start + end) / 2.0,
-                1.012,
-                mode.name,
-                transform=axes.get_xaxis_transform(),
-                ha="center",
-                va="bottom",
-                size=8.0,
-                color=MUTED_COLOUR,
-            )

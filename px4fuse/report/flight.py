@@ -30,9 +30,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     panels.add_legend(page, analysis)
-    panels.POSITION.draw_on_page(
-        page, analysis, result, with_time_label=False, with_mode_names=True
-    )
+    panels.POSITION.draw_on_page(page, analysis, result, with_time_label=False)
     panels.VELOCITY.draw_on_page(page, analysis, result, with_time_label=True)
     page.write(unexplained_note(analysis), above=6.0)
     yield page
@@ -43,10 +41,8 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
-        is_last, is_first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
-        panel.draw_on_page(
-            page, analysis, result, with_time_label=is_last, with_mode_names=is_first
-        )
+        is_last = panel is panels.SIGMA_V
+        panel.draw_on_page(page, analysis, result, with_time_label=is_last)
     _draw_zoom(page, analysis)
     for note in verdict_notes(analysis):
         page.write_small(note)

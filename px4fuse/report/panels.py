@@ -67,7 +67,6 @@ class Panel(NamedTuple):
         result: AxisComparison,
         *,
         with_time_label: bool,
-        with_mode_names: bool = False,
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot of one axis on a page.
@@ -76,8 +75,6 @@ class Panel(NamedTuple):
         ----------
         with_time_label : bool
             Label the time axis, which all panels above share.
-        with_mode_names : bool
-            Write the names of the flight modes above the plot.
         is_narrow : bool
             Draw the plot in a narrow column: without caption, with the numbers below the plot.
         """
@@ -94,7 +91,6 @@ class Panel(NamedTuple):
             caption,
             height,
             axis=rejection_axis,
-            with_mode_names=with_mode_names,
             with_time_label=with_time_label,
         )
         if is_narrow:

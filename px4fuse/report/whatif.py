@@ -7,7 +7,7 @@ from px4fuse.core.text import format_number
 from px4fuse.ekf2.whatif import (
     ADDED_NOISE_M,
     HEIGHT_TIMEOUT_S,
-    MAX_REJECTED_SHARE,
+    MAX_REJECTED_FRACTION,
     AxisSummary,
     HeightSummary,
     Summary,
@@ -150,7 +150,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
+            f"Not predictable: more than {MAX_REJECTED_FRACTION:.0%} of the samples would "
             f"be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would change "
             f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. The "
             "statistics then depend on the rejection of single samples."

@@ -109,7 +109,6 @@ class Prediction(Record, frozen=True):
 
     @property
     def text(self) -> str:
-        """Question and ranges as the answer form prints them."""
         first, *_, last = numbers = [f"{limit:.3g}" for limit in self.limits]
         middle_ranges = [f"{low} to {high}" for low, high in pairwise(numbers)]
         ranges = (f"below {first}", *middle_ranges, f"above {last}")
@@ -180,7 +179,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Pairs of quantities for the questions of a form: one of each pair is drawn at random
+# Quantities for the three questions of a form: one of each pair is drawn at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -207,7 +206,6 @@ class FormQuestion(Record, frozen=True):
 
     @property
     def text(self) -> str:
-        """Question as the answer form prints it."""
         update, number = self.update, f"{self.duration_or_gate:g}"
         quantity = {
             "gain": f"position gain of update {update}",

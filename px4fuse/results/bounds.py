@@ -6,7 +6,6 @@ The bounds depend on the name of a field, which contains quantity and unit.
 import math
 import re
 from collections.abc import Mapping
-from operator import is_
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -45,7 +44,7 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their bounds from results; results without them are not changed.
+    """Remove numbers outside their bounds from results.
 
     An optional number is omitted. If a required number is outside its bounds, its record is omitted
     or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes`` of the results.
@@ -60,13 +59,11 @@ def within_bounds(results: T) -> T:
         checked: T = _check_value(results, None, "", reasons)
     except _OutsideError as error:
         raise ResultsError(f"the results are not usable: {error}", REMEDY) from error
-    if not reasons:
-        return results
     if hasattr(checked, "missing"):
-        exceeded_bounds = (
-            Unavailable(reason.split(" ", 1)[0], reason, REMEDY) for reason in reasons
+        removed_numbers = (
+            Unavailable(reason.partition(" ")[0], reason, REMEDY) for reason in reasons
         )
-        return replace(checked, missing=(*checked.missing, *exceeded_bounds))
+        return replace(checked, missing=(*checked.missing, *removed_numbers))
     return (
         replace(checked, notes=(*checked.notes, *reasons)) if hasattr(checked, "notes") else checked
     )
@@ -108,9 +105,8 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
                 value_after = None
             else:
                 value_after = _make_unavailable(value_before, field.type, name, error, reasons)
-        if value_after is not value_before:
-            changes[field.name] = value_after
-    return replace(value, **changes) if changes else value
+        changes[field.name] = value_after
+    return replace(value, **changes)
 
 
 def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str]) -> Any:
@@ -129,8 +125,7 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
                 reasons.append(str(error))
     if not checked and any(getattr(meta, "min_length", 0) for meta in get_args(kind)[1:]):
         raise _OutsideError(reasons[-1])
-    is_unchanged = len(checked) == len(value) and all(checked[key] is value[key] for key in value)
-    return value if is_unchanged else checked
+    return checked
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
@@ -143,8 +138,7 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
             if not isinstance(element, msgspec.Struct):
                 raise
             reasons.append(str(error))
-    is_unchanged = len(checked) == len(value) and all(map(is_, value, checked))
-    return value if is_unchanged else tuple(checked)
+    return tuple(checked)
 
 
 def _make_unavailable(

@@ -140,7 +140,6 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
 
 
 def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
-    """Return the results of ``px4fuse loop`` for a pose graph file."""
     return within_bounds(
         contract.GraphResults(
             schema_of("px4fuse-graph"), to_serializable(solved_graph), provenance(command)

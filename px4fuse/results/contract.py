@@ -6,7 +6,7 @@ ignored.
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -98,7 +98,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning that contains the maximum-likelihood estimate, by KF setting
+# Field of AxisTuning with the maximum-likelihood estimate of a KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
@@ -324,22 +324,6 @@ RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of the results of all commands."""
-    kinds: dict[type, None] = dict.fromkeys(RESULTS_BY_SCHEMA.values())
-    components: dict[str, Any] = {}
-
-    def describe(kind: Any) -> dict[str, Any]:
-        if kind is msgspec.UnsetType:  # a field that is not written
-            return {"not": {}}
-        kinds.update(dict.fromkeys(kind.union_members))
-        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
-
-    count = 0
-    # repeated until describe_union finds no new types inside of RecordOrUnavailable types
-    while count < len(kinds):
-        count = len(kinds)
-        _, components = msgspec.json.schema_components(
-            list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
-        )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"px4fuse-results-{SCHEMA_VERSION}",
@@ -353,8 +337,30 @@ def schema() -> dict[str, Any]:
             }
             for name, kind in RESULTS_BY_SCHEMA.items()
         ],
-        "$defs": components,
+        "$defs": schema_of_types(RESULTS_BY_SCHEMA.values())[1],
     }
+
+
+def schema_of_types(types: Collection[type]) -> tuple[Sequence[dict[str, Any]], dict[str, Any]]:
+    """Return the JSON Schema of each type, and the definitions to which these schemas refer."""
+    kinds = dict.fromkeys(types)
+    schemas: tuple[dict[str, Any], ...] = ()
+    components: dict[str, Any] = {}
+
+    def describe(kind: Any) -> dict[str, Any]:
+        if kind is msgspec.UnsetType:  # a field that is not written
+            return {"not": {}}
+        kinds.update(dict.fromkeys(kind.union_members))
+        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
+
+    count = 0
+    # repeated until describe finds no new types inside of RecordOrUnavailable types
+    while count < len(kinds):
+        count = len(kinds)
+        schemas, components = msgspec.json.schema_components(
+            list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
+        )
+    return schemas[: len(types)], components
 
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:

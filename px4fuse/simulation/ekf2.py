@@ -1,14 +1,11 @@
 """EKF2 topics of a simulated flight as PX4 v1.16 logs them, from px4fuse's model of EKF2.
 
-The model :mod:`px4fuse.ekf2` starts with PX4's initial variances and levelling at rest, then runs
-on the simulated IMU and positions. Its error states are linearised about the true attitude. The
-difference between integrated gyro and true attitude is an input of the model, so the estimate does
-not depend on the true attitude.
+The model :mod:`px4fuse.ekf2` starts at rest with PX4's initial variances, and runs on the simulated
+IMU and positions. Its error states are linearised about the true attitude.
 
-Outdoors, EKF2 fuses magnetometer and barometer, and vehicle_attitude is the model's estimate.
-Indoors, heading and height of EKF2 have a simulated slow error. vehicle_attitude is then simulated
-without the model, so that KF does not depend on EKF2 parameters; the model's attitude is in
-estimator_states.
+Outdoors, EKF2 fuses magnetometer and barometer. Indoors, its heading and height have a simulated
+slow error. vehicle_attitude is then simulated without the model, so that KF does not depend on EKF2
+parameters.
 """
 
 from collections.abc import Mapping
@@ -69,18 +66,23 @@ from px4fuse.trajectory.rotation import (
 PREDICTION_STEP_US = 10_000
 # Initial σ (gauss) per axis of earth field and magnetometer bias, after alignment on the ground
 FIELD_SIGMA_GAUSS = 0.03
-# Rules by which EKF2 (v1.14 and later) starts, stops and resets fusion of external vision:
-# EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
-VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, uses_delay_as_horizon=False)
-# Rules by which EKF2 v1.16 starts, stops and resets fusion of GNSS: gps_control.cpp, and
-# no_aid_timeout_max (common.h)
+# Rules of EKF2 v1.14 and later for external vision (ev_control.cpp, common.h)
+VISION_RULES = FusionRules(
+    start_interval_s=0.2,
+    stop_s=0.4,
+    reset_s=1.0,
+    max_resets=5,
+    min_bias_variance=None,
+    uses_delay_as_horizon=False,
+)
+# Rules of EKF2 v1.16 for GNSS (gps_control.cpp, common.h)
 GNSS_RULES = FusionRules(
-    np.inf,
-    np.inf,
-    7.0,
-    UNLIMITED_RESETS,
-    None,
-    False,
+    start_interval_s=np.inf,
+    stop_s=np.inf,
+    reset_s=7.0,
+    max_resets=UNLIMITED_RESETS,
+    min_bias_variance=None,
+    uses_delay_as_horizon=False,
     reset_variance_factor=2.0,
     resets_velocity=True,
 )
@@ -100,8 +102,7 @@ REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) between the times at which the model computes the variances of the topic
-# estimator_states
+# Maximum interval (s) between the variances that the model computes for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -146,13 +147,8 @@ def simulate_ekf2(
 ) -> tuple[Topic, ...]:
     """Simulate EKF2 and return its topics, without empty ones.
 
-    Parameters
-    ----------
-    imu, source, other_sensors : Topic, SimulatedPositions, tuple of Topic
-        Sensor data that EKF2 received, before logging. Outdoors ``other_sensors`` are magnetometer
-        and barometer.
-    log_parameters : mapping
-        All parameters in the log, by PX4 name.
+    The sensor data are those that EKF2 received, before logging. ``other_sensors`` are magnetometer
+    and barometer outdoors. ``log_parameters`` are all parameters in the log, by PX4 name.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
@@ -192,10 +188,7 @@ def simulate_ekf2(
 def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
-    """Prepare the input of the EKF2 model.
-
-    Return also the times (µs) and the true attitudes of its prediction steps.
-    """
+    """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
@@ -237,8 +230,7 @@ def _make_segment(
             state=state,
             variance=variance,
             down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
-            # infinite variance of the tilt: the model has no logged tilt, so only positions correct
-            # the tilt
+            # without logged tilt (infinite variance), only positions correct the tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
@@ -253,12 +245,13 @@ def _make_segment(
 
 
 def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
-    """Add earth field and magnetometer bias to the states, as aligned at rest on the ground."""
+    """Add earth field and magnetometer bias to the states of the EKF2 model."""
     measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
-    gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
-    fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
+    field_gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
+    # EKF2 has aligned these states on the ground
+    state_gauss = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
     return add_field_states(
-        segment, measured_at_s, gauss, 1.0, fields, np.full(6, FIELD_SIGMA_GAUSS**2)
+        segment, measured_at_s, field_gauss, 1.0, state_gauss, np.full(6, FIELD_SIGMA_GAUSS**2)
     )
 
 
@@ -276,20 +269,20 @@ def _initial_state_at_rest(
 ) -> tuple[Array, Array]:
     """Compute EKF2's error state and covariance at the start of the log, after REST_BEFORE_LOG_S.
 
-    PX4's initial covariance is updated with the known values at rest: specific force -g, angular
-    rate and velocity 0. This update correlates tilt error and accelerometer bias.
+    One Kalman update of PX4's initial covariance uses the known values at rest: specific force -g,
+    angular rate and velocity 0.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
     H[0:3, ACCELEROMETER_BIAS] = -rotation
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
-    measured = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
+    z = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
     P = np.diag(INITIAL_SIGMA**2)
     x = np.zeros(STATE_COUNT)
     P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SIGMA**2))
-    x += K @ (measured - H @ x)
+    x += K @ (z - H @ x)
     x[HEADING] = heading_error_rad
     P -= K @ H @ P
     return x, 0.5 * (P + P.T)
@@ -367,10 +360,9 @@ def _make_topic_track(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Hold the position in ``state`` (in place) while EKF2 fuses no aiding source.
+    """Keep the position in ``state`` constant while EKF2 has no aiding source, as PX4 does.
 
-    EKF2 then fuses a constant position, which the model does not contain. Return the position
-    resets (step, size in m), and a mask of the steps with an aiding source.
+    Return the position resets (step, size in m), and a mask of the steps with an aiding source.
     """
     events, time = model_run.events[0], model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)

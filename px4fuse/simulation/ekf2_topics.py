@@ -26,7 +26,7 @@ LOCAL_POSITION_HZ = 10.0
 FLAGS_HZ = 1.0
 MAGNETOMETER_HZ = 2.0
 OTHER_AIDS_HZ = 2.0
-# Time (µs) from the newest IMU sample to the publication of EKF2's output
+# Time (µs) from the newest IMU sample to the publication of vehicle_local_position
 PUBLICATION_DELAY_US = 100
 
 
@@ -40,10 +40,8 @@ class TopicTrack:
         Times of the steps, µs from the first data.
     lag_steps : int
         Number of prediction steps from the fusion horizon to the publication.
-    delayed_attitude : ndarray
-        Quaternions at the fusion horizon.
-    delayed_states : ndarray
-        Velocity, position, gyro and accelerometer bias at the fusion horizon.
+    delayed_attitude, delayed_states : ndarray
+        Quaternions, and velocity, position, gyro and accelerometer bias, at the fusion horizon.
     velocity_m_s, position_m, attitude : ndarray
         State that the output predictor publishes.
     resets : tuple of (int, ndarray)
@@ -62,18 +60,18 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     is_aided: BoolArray
 
-    def timestamps(self, rows: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
-        """Return the timestamps of messages about the prediction steps ``rows``.
+    def timestamps(self, steps: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
+        """Return the timestamps of messages that EKF2 publishes after the prediction ``steps``.
 
         ``measured_s`` are the measurement times (s), by default the times of the steps.
         """
-        sample_us = self.time_us[rows]
+        sample_us = self.time_us[steps]
         if measured_s is not None:
             sample_us = np.rint(measured_s * 1e6).astype(np.int64)
-        return sensors.timestamps(sample_us, self.time_us[rows + self.lag_steps] - sample_us)
+        return sensors.timestamps(sample_us, self.time_us[steps + self.lag_steps] - sample_us)
 
     def logged_events(self, is_message: BoolArray, end_step: IntArray, rate_hz: float) -> IntArray:
-        """Return the indices of events with a message that the logger writes at a rate (Hz)."""
+        """Return the indices of messages that a logger with a rate limit (Hz) writes."""
         is_published = end_step < len(self.time_us) - self.lag_steps
         events = np.flatnonzero(is_message & is_published)
         times_s = sensors.seconds(self.time_us[end_step[events]])
@@ -89,14 +87,8 @@ def ekf2_topics(
 ) -> tuple[Topic, ...]:
     """Return the EKF2 topics of a flight, without empty ones.
 
-    Parameters
-    ----------
-    model_run : SegmentRun
-        Run of the EKF2 model with one parameter set over the flight.
-    attitude_hz : float
-        Rate (Hz) of vehicle_attitude, which EKF2 publishes if it fuses a magnetometer.
-    aid_source_hz : float
-        Logging rate (Hz) of estimator_aid_src_ev_pos; 0 logs all messages.
+    ``attitude_hz`` is the rate of vehicle_attitude, and ``aid_source_hz`` the rate at which
+    estimator_aid_src_ev_pos is logged (0: all messages).
     """
     topics = (
         _local_position_topic(track, is_gnss=inputs.aid == GNSS_POS),
@@ -126,9 +118,9 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
 
 def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
     """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
-    end = model_run.events[0].end_step
-    events = track.logged_events(np.diff(end, prepend=0) > 0, end, STATES_HZ)
-    rows = end[events]
+    end_step = model_run.events[0].end_step
+    events = track.logged_events(np.diff(end_step, prepend=0) > 0, end_step, STATES_HZ)
+    rows = end_step[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
     states[:, 4 : 4 + track.delayed_states.shape[1]] = track.delayed_states[rows]
@@ -146,11 +138,11 @@ def _aid_sources(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    events, run, aid = model_run.events[0], model_run, inputs.aid
+    events, run, received = model_run.events[0], model_run, inputs.received
     event_rows = track.logged_events(events.usable, events.end_step, rate_hz)
-    rows, sample, received = events.end_step[event_rows], events.sample[event_rows], inputs.received
-    aid_stamps = track.timestamps(rows, events.time_s[event_rows])
-    measured_m = received.position_m[sample, :2]
+    steps, sample_indices = events.end_step[event_rows], events.sample[event_rows]
+    timestamps = track.timestamps(steps, events.time_s[event_rows])
+    measured_m = received.position_m[sample_indices, :2]
     north, east = measured_m.T
     innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
     innovation, variance, noise = (
@@ -159,22 +151,22 @@ def _aid_sources(
     is_not_tested = np.isnan(innovation[:, :1])
     # EKF2 also logs an innovation for positions that it does not test, but the model computes none
     innovation = np.where(
-        is_not_tested, measured_m - track.delayed_states[rows][:, POSITION][:, :2], innovation
+        is_not_tested, measured_m - track.delayed_states[steps][:, POSITION][:, :2], innovation
     )
     variance = np.where(
         is_not_tested, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance
     )
     fused_us = np.where(
-        run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[rows], -1
+        run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[steps], -1
     )
     newest_fused_us = np.maximum.accumulate(fused_us)
     last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
     is_gnss = received.velocity_m_s is not None
     observed = unproject(north, east, sensors.HOME_POSITION[:2]) if is_gnss else (north, east)
     position_topic = _aid_source(
-        aid,
+        inputs.aid,
         inputs.settings,
-        aid_stamps | {"time_last_fuse": last_fused_us},
+        timestamps | {"time_last_fuse": last_fused_us},
         np.stack(observed, axis=1),
         (innovation, variance, noise),
         (run.rejected[event_rows, 0], run.fused[event_rows, 0]),
@@ -191,8 +183,8 @@ def _aid_sources(
     return position_topic, _aid_source(
         GNSS_VEL,
         inputs.settings,
-        aid_stamps,
-        received.velocity_m_s[sample],
+        timestamps,
+        received.velocity_m_s[sample_indices],
         (velocity_innovation, velocity_innovation_variance, velocity_noise),
         (is_outside_gate, ~is_outside_gate & np.isfinite(velocity_innovation).all(axis=1)),
     )
@@ -200,10 +192,10 @@ def _aid_sources(
 
 def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> list[Topic]:
     """Make estimator_aid_src_baro_hgt; the list is empty without barometer."""
-    heights, end = model_run.segment.heights, model_run.events[0].end_step
+    heights, end_step = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
-    update_rows = model_run.heights.updates(BAROMETER.name, 0, end.astype(float))
+    update_rows = model_run.heights.updates(BAROMETER.name, 0, end_step.astype(float))
     update_rows = update_rows[
         update_rows["fused_at_s"] < len(track.time_us) - track.lag_steps
     ].iloc[1:]
@@ -231,12 +223,13 @@ def _magnetometer_topics(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
     """Make the topics that need a magnetometer; the list is empty without magnetometer."""
-    field, settings, end = model_run.segment.field, inputs.settings, model_run.events[0].end_step
+    field, settings = model_run.segment.field, inputs.settings
+    end_step = model_run.events[0].end_step
     if field is None:
         return []
     has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
-    event_rows = track.logged_events(has_sample, end, OTHER_AIDS_HZ)
-    rows = end[event_rows]
+    event_rows = track.logged_events(has_sample, end_step, OTHER_AIDS_HZ)
+    rows = end_step[event_rows]
     innovation, variance, fused = np.moveaxis(model_run.field[event_rows, :, 0], 1, 0)
     observation = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
@@ -279,19 +272,15 @@ def _aid_source(
 ) -> Topic:
     """Return estimator_aid_src_* of an aiding source.
 
-    Parameters
-    ----------
-    innovation_values : tuple of ndarray
-        Innovation, innovation variance S, and measurement variance R.
-    decisions : tuple of ndarray of bool
-        True for rejected samples, and True for fused samples.
+    ``innovation_values`` are innovation, its variance S, and the measurement variance R.
+    ``decisions`` are masks of rejected and of fused samples.
     """
-    innovation, variance, noise = innovation_values
+    innovation, variance, noise_variance = innovation_values
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
         **timestamps,
         "observation": observation,
-        "observation_variance": noise,
+        "observation_variance": noise_variance,
         "innovation": -innovation,
         "innovation_variance": variance,
         "test_ratio": ratio,

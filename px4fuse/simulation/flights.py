@@ -35,21 +35,7 @@ ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated flight: logged topics, and the true values that the log does not contain.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    mistakes : Mistakes
-    motion : Motion
-        True motion as a function of time.
-    positions : SimulatedPositions
-        Positions with their outliers and errors.
-    topics : tuple of Topic
-        All logged topics.
-    parameters : mapping
-        Logged parameters, by PX4 name.
-    """
+    """Simulated flight: logged topics and parameters, and values that the log does not contain."""
 
     scenario: Scenario
     mistakes: Mistakes
@@ -117,7 +103,6 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    """Simulate a flight, and read its ULog as :func:`px4fuse.read_log` does."""
     return to_flight(simulate(scenario, mistakes))
 
 
@@ -156,19 +141,10 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
 
 
 def answer(simulation: Simulation) -> dict[str, Any]:
-    """Return the true values of a simulated flight for the instructor, as JSON types.
-
-    Keys
-    ----
-    mistakes
-        Help text and expected finding of each injected fault, by name.
-    truth
-        Biases, noises, time offset to add to the position timestamps, outliers (index and time in
-        the logged topic), and loop closure error.
-    """
+    """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions
-    accelerometer, gyro = sensors.biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, mistakes)
     first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
     timestamps_us = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
     outlier_indices = np.flatnonzero(source.is_outlier)
@@ -191,8 +167,8 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                 "sigma_z_m": scenario.source_sigma_m,
                 "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, mistakes.vibration_m_s2)),
                 "reported_sigma_m": sensors.reported_sigma_m(scenario, mistakes),
-                "accelerometer_bias_m_s2": accelerometer.tolist(),
-                "gyro_bias_rad_s": gyro.tolist(),
+                "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
+                "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
                 "clock_offset_to_add_s": 0.0 - mistakes.clock_offset_s,
                 "outlier_index": outlier_indices.tolist(),
                 "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),

@@ -15,15 +15,9 @@ from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
 
 @dataclass(frozen=True)
 class Mistakes:
-    """Sizes of all injected faults; the defaults are a flight without faults.
+    """Sizes of all injected faults, which ``mistakes.toml`` explains; the defaults are no faults.
 
-    :data:`MISTAKES` explains each fault. Outliers occur in bursts with one horizontal direction
-    and the mean size ``nlos_size_m``. Default times: gaps in the middle of the flight, jumps at two
-    thirds, heading errors from the start. A rate of 0 is the rate of the scenario, an EKF2 noise of
-    0 the σ that the source reports, and an EKF2 delay of None the correct delay. ``r_scale``
-    multiplies the reported variance. ``yaw_deg`` rotates the positions about the start, clockwise
-    seen from above. ``vibration_m_s2`` is the standard deviation of the mean vibration acceleration
-    over 0.1 s.
+    A rate of 0 does not change the rate. An EKF2 noise of 0 and an EKF2 delay of None are right.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
@@ -73,17 +67,12 @@ class Mistake:
     ----------
     default : float or True
         Default of the first field; True for a fault without a size.
-    help : str
-        Description of the fault, for instructors.
     finding : str
         Finding that a student is expected to report.
-    kinds : tuple of str
-        Kinds of flight in which the fault is possible.
     changes_ekf2 : bool
         True if the fault changes EKF2 parameters.
     fields : tuple of str
-        Fields of :class:`Mistakes` that the fault sets: their names begin with the name of the
-        fault. The command line requires the first value; the others are optional.
+        Fields of :class:`Mistakes` that the fault sets; values of all but the first are optional.
     """
 
     default: float | bool
@@ -108,6 +97,7 @@ class Mistake:
 MISTAKES: Mapping[str, Mistake] = {
     name: replace(
         mistake,
+        # the names of the fields begin with the name of the fault
         fields=tuple(
             field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
         ),
@@ -134,14 +124,14 @@ def parse(texts: Iterable[str]) -> Mistakes:
     """
     value_by_field: dict[str, float] = {}
     for text in texts:
-        name, equals, values = text.strip().partition("=")
+        name, separator, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
                 f"--mistake {text}: px4fuse cannot inject the fault {name}",
                 f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
-        typed_values = values.split(",") if equals else []
+        typed_values = values.split(",") if separator else []
         if len(typed_values) > len(mistake.sizes):
             raise SettingsError(
                 f"--mistake {text} has too many values: give {name}{mistake.usage}."

@@ -45,16 +45,16 @@ SINE_COUNT = 4
 def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     """Return a function of time that changes in quintic ramps, and is constant between them.
 
-    ``ramps`` are tuples of start (s), duration (s) and change; the function is zero before the
-    first ramp.
+    ``ramps`` are tuples of start (s), duration (s) and change. Before the first ramp, the function
+    is zero.
     """
     start_s, length_s, change = (np.array(values) for values in zip(*ramps, strict=True))
-    level = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
+    value_after = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
     end_s = start_s + length_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
     # a ramp that starts at the end of the previous ramp continues it
     is_used = np.diff(times_s, prepend=-np.inf) > MIN_RAMP_DISTANCE_S
-    values = np.repeat(level, 2, axis=0)[is_used]
+    values = np.repeat(value_after, 2, axis=0)[is_used]
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
@@ -67,14 +67,7 @@ def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[
 
 @dataclass(frozen=True)
 class Sines:
-    """Sum of m sines on each of k axes, with the same angular frequencies on all axes.
-
-    Attributes
-    ----------
-    angular_frequency_rad_s : ndarray, shape (m,)
-    sine, cosine : ndarray, shape (m, k)
-        Amplitudes.
-    """
+    """Sum of m sines on each of k axes: angular frequencies, shape (m,), and amplitudes, (m, k)."""
 
     angular_frequency_rad_s: Array
     sine: Array
@@ -104,13 +97,7 @@ class Sines:
 
 @dataclass(frozen=True)
 class State:
-    """True state at n times, NED; shape (n, 3) unless noted.
-
-    Attributes
-    ----------
-    position_m, velocity_m_s, acceleration_m_s2, jerk_m_s3 : ndarray
-    yaw_rad, yaw_rate_rad_s : ndarray, shape (n,)
-    """
+    """True state at n times: vectors (NED), shape (n, 3), and yaw and yaw rate, shape (n,)."""
 
     position_m: Array
     velocity_m_s: Array
@@ -122,15 +109,9 @@ class State:
 
 @dataclass(frozen=True)
 class Motion:
-    """True motion of a planned flight.
+    """True motion of a flight: velocity (NED) and yaw (rad) as functions of time.
 
-    Attributes
-    ----------
-    velocity, yaw : PPoly
-        Velocity along the path (NED), and yaw angle (rad), as functions of time.
-    deviation : Sines
-        Slow deviation from the path.
-    take_off_s, touch_down_s, duration_s : float
+    ``deviation`` is a slow deviation from the path.
     """
 
     velocity: PPoly

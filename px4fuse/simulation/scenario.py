@@ -28,17 +28,10 @@ DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits of a numeric option or field.
+    """Limits of a numeric option, with its unit (:data:`px4fuse.core.units.UNIT_NAMES`).
 
-    Attributes
-    ----------
-    low, high : float
-    unit : str
-        As in :data:`px4fuse.core.units.UNIT_NAMES`.
-    cli_name : str
-        Name of the option, or placeholder in the syntax of a `--mistake`.
-    meaning : str
-        Help text of the option; empty for a field without option.
+    ``cli_name`` is the name of the option, or the placeholder in the syntax of a ``--mistake``.
+    ``meaning`` is the help text of the option; empty for a field without option.
     """
 
     low: float
@@ -50,8 +43,8 @@ class Bounds:
     def check(self, value: float, name: str) -> None:
         """Raise SettingsError if a value is out of range; ``name`` is its name in the message."""
         if not self.low <= value <= self.high:  # also True for NaN
-            allowed = f"give {self.low:g} to {self.high:g} {self.unit}".rstrip()
-            raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
+            range_text = f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+            raise SettingsError(f"{name} {value:g} is out of range: give {range_text}.")
 
 
 def bounded_number(default: Any, *bounds: Any) -> Any:
@@ -68,54 +61,22 @@ def quantities(record: type) -> dict[str, Bounds]:
 class Scenario:
     """Path and sensors of a simulated flight, without injected faults.
 
+    Noises are standard deviations of white noise, on each axis. The GNSS noises are horizontal.
+
     Attributes
     ----------
     kind : {"aisle", "loop", "outdoor"}
-        Passes along a straight line with UWB, or laps of a square with VIO or, outdoors, with GNSS.
-    passes : int
-        Passes of the aisle, or laps of the square.
-    length_m : float
-        Length of the aisle, or of a side of the square.
-    speed_m_s : float
-    heading_deg : float
-        Direction of the aisle or of the square's first side, clockwise from north.
-    altitude_m : float
+        Passes along a straight line with UWB, laps of a square with VIO, or laps with GNSS.
     yaw : {"fixed", "follow"} or None
-        "fixed": constant heading of the nose; "follow": nose along the direction of flight. None:
-        fixed in the aisle, follow around the square.
+        Constant heading, or nose along the direction of flight; None: fixed in the aisle only.
     pause_s : float
         Time of hover at each end of the aisle.
     wander_m : float
         RMS of the slow deviation from the path, on each axis.
-    uwb_rate_hz, sigma_uwb_m : float
-        UWB rate and white noise, equal on all axes.
-    vio_rate_hz, sigma_vio_m : float
-        VIO rate and white noise.
-    vio_drift : float
-        VIO drift in one horizontal direction, as a fraction of the distance flown.
     vio_walk_m : float
         Random walk of the VIO drift, m per √m flown, on each axis.
-    gnss_rate_hz, sigma_gnss_m, sigma_gnss_m_s : float
-        GNSS rate, and horizontal noise of position and velocity; the vertical noise is 1.5 times
-        the horizontal one.
-    sigma_a_m_s2 : float
-        White noise of the accelerometer, as standard deviation of the mean over 0.1 s: the SIGMA_A
-        of KF. The noise of a single sample is larger by the factor √(0.1 s · ``imu_rate_hz``).
-    accel_bias_sigma_m_s2, gyro_bias_sigma_rad_s : float
-        Standard deviations of the random constant biases, per body axis.
-    gyro_noise_rad_s : float
-        White noise of a single gyro sample.
     tilt_error_deg, yaw_error_deg : float
-        RMS of the slow error (periods of 20 to 60 s) of the logged attitude. Indoors, EKF2 has this
-        heading error.
-    imu_rate_hz, attitude_rate_hz, truth_rate_hz : float
-    truth : bool
-        True if the ground truth is logged.
-    ekf2 : bool
-        True if the log contains the output of px4fuse's EKF2 model.
-    seed : int
-        Seed of all random numbers. Each sensor has a separate stream of random numbers, so a
-        fault in one sensor does not change the noise of other sensors.
+        RMS of the slow error of the logged attitude. Indoors, EKF2 has this heading error.
 
     Raises
     ------
@@ -204,18 +165,15 @@ class Scenario:
 
     @property
     def nose_follows_path(self) -> bool:
-        """True if the nose points along the direction of flight."""
         return self.yaw == "follow" or (self.yaw is None and self.kind != "aisle")
 
     @property
     def source_rate_hz(self) -> float:
-        """Rate of the position source (Hz)."""
         rates = {"aisle": self.uwb_rate_hz, "loop": self.vio_rate_hz, "outdoor": self.gnss_rate_hz}
         return rates[self.kind]
 
     @property
     def source_sigma_m(self) -> float:
-        """White noise of the position source (m)."""
         sigmas = {"aisle": self.sigma_uwb_m, "loop": self.sigma_vio_m, "outdoor": self.sigma_gnss_m}
         return sigmas[self.kind]
 
@@ -226,7 +184,7 @@ class Scenario:
 
     @property
     def accelerometer_noise_m_s2(self) -> float:
-        """White noise of a single accelerometer sample (m/s²)."""
+        """White noise of one accelerometer sample (m/s²); SIGMA_A is the noise of a 0.1 s mean."""
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 

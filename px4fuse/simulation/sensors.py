@@ -98,17 +98,16 @@ class SimulatedPositions:
 
     Attributes
     ----------
-    topic : Topic
-    is_outlier : ndarray of bool, shape (n,)
-        True for positions that are simulated outliers.
     position_m : ndarray, shape (n, 3)
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
         Velocity measured by GNSS, NED; None for UWB and VIO.
     measured_s : ndarray, shape (n,)
         True times of measurement (s from the first data).
-    distance_m, drift_m : float, ndarray of shape (3,)
-        Horizontal distance flown, and VIO drift at the end (NED).
+    distance_m : float
+        Horizontal distance flown.
+    drift_m : ndarray, shape (3,)
+        VIO drift at the end, NED.
     """
 
     topic: Topic
@@ -123,37 +122,36 @@ class SimulatedPositions:
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
     rng = random_stream(scenario, Stream.BIAS)
-    accelerometer = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
-    accelerometer[0] += mistakes.accel_bias_m_s2
-    return accelerometer, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
+    accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
+    accelerometer_bias_m_s2[0] += mistakes.accel_bias_m_s2
+    return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
 
 
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(seconds(time_us)))
-    bias_a, bias_g = biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
     rng = random_stream(scenario, Stream.IMU)
     shape = (len(time_us), 3)
-    force = truth.specific_force_m_s2 + bias_a
-    force += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
-    rate = truth.angular_rate_rad_s + bias_g
-    rate += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
+    force_m_s2 = truth.specific_force_m_s2 + accelerometer_bias_m_s2
+    force_m_s2 += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
+    rate_rad_s = truth.angular_rate_rad_s + gyro_bias_rad_s
+    rate_rad_s += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
+        force_m_s2 += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
         "timestamp": _to_boot_time(time_us),
-        "gyro_rad": rate,
-        "accelerometer_m_s2": force,
+        "gyro_rad": rate_rad_s,
+        "accelerometer_m_s2": force_m_s2,
     }
     return topic("sensor_combined", sample_fields | integral_fields)
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Simulate vehicle_magnetometer at the full rate."""
     time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
     # outdoors the measured field is rotated, which causes the heading error of EKF2
@@ -169,7 +167,6 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    """Simulate vehicle_air_data (barometer) at the full rate."""
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
@@ -214,13 +211,15 @@ def mean_imu_at_rest(
 ) -> tuple[Array, Array]:
     """Simulate the mean specific force (m/s²) and angular rate (rad/s) at rest before the log."""
     truth = attitude(motion.at(np.zeros(1)))
-    bias_a, bias_g = biases(scenario, mistakes)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
     rng = random_stream(scenario, Stream.REST)
     noise_factor = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
-    force = truth.specific_force_m_s2[0] + bias_a
-    force += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
-    rate = truth.angular_rate_rad_s[0] + bias_g
-    return force, rate + noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(3)
+    force_m_s2 = truth.specific_force_m_s2[0] + accelerometer_bias_m_s2
+    force_m_s2 += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
+    rate_rad_s = truth.angular_rate_rad_s[0] + gyro_bias_rad_s
+    return force_m_s2, rate_rad_s + noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(
+        3
+    )
 
 
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
@@ -233,14 +232,12 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    """Make vehicle_attitude_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
 def quaternions(body_to_ned: Array) -> Array:
-    """Convert rotation matrices to quaternions (w, x, y, z)."""
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
@@ -253,10 +250,10 @@ def attitude_topic(
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
-    tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
+    tilt_deg, yaw_deg = scenario.tilt_error_deg, scenario.yaw_error_deg
+    rms_rad = np.radians([tilt_deg, tilt_deg, yaw_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
-    rms = np.array([tilt, tilt, yaw])
-    error = Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0]
+    error = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
         size = np.radians(mistakes.heading_deg)
         if mistakes.heading_at_s is not None:
@@ -273,13 +270,12 @@ def land_detector(motion: Motion) -> Topic:
     time_us = np.union1d(
         np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), changes_us
     )
-    landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
-    landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
+    is_landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
+    landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
     return topic("vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags})
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    """Make vehicle_local_position_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
     fields = timestamps(time_us) | vectors(
@@ -358,16 +354,17 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
 
 
 def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
-    """Return the σ (m) that the source reports; at least 0.01 m without ``r_scale`` (EKF2.cpp)."""
+    """Return the σ (m) that the source reports."""
+    # EKF2.cpp uses at least 0.01 m
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
-    decay = np.exp(-interval_s / mistakes.slow_error_s)
-    noise[1:] *= np.sqrt(1.0 - decay**2)
-    return np.asarray(lfilter([1.0], [1.0, -decay], noise, axis=0))
+    decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
+    noise[1:] *= np.sqrt(1.0 - decay_factor**2)
+    return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
@@ -382,10 +379,10 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 def outliers(
     scenario: Scenario, mistakes: Mistakes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
-    """Simulate outliers: error of each position (m, NED), shape (n, 3), and mask of the outliers.
+    """Simulate outliers; return the errors (m, NED), shape (n, 3), and a mask of the outliers.
 
-    Outliers occur in bursts while airborne, as from an anchor without line of sight. A burst has
-    one horizontal direction; the sizes are 0.5 to 1.5 times ``nlos_size_m``.
+    Outliers occur in bursts in one horizontal direction, as from an anchor without line of sight.
+    The sizes are 0.5 to 1.5 times ``nlos_size_m``.
     """
     offset_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
@@ -419,8 +416,7 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     """Return a mask of the samples that a logger with a rate limit (Hz) writes; 0 is no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # a logging interval starts 1e-6 intervals early, so that rounding does not move a sample at its
-    # start into the previous interval
+    # the added 1e-6 prevents that rounding moves a sample into the previous logging interval
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
@@ -460,7 +456,6 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """Make vehicle_gps_position from positions relative to HOME_POSITION."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
     accuracy_fields = {
         "eph": sigma_m,
@@ -479,9 +474,13 @@ def _gnss_topic(
 
 
 def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
-    decay = np.exp(-interval_s / time_constant_s)
+    decay_factor = np.exp(-interval_s / time_constant_s)
     filtered_m, _ = lfilter(
-        [1.0 - decay], [1.0, -decay], position_m, axis=0, zi=decay * position_m[:1]
+        [1.0 - decay_factor],
+        [1.0, -decay_factor],
+        position_m,
+        axis=0,
+        zi=decay_factor * position_m[:1],
     )
     return np.asarray(filtered_m)
 
@@ -500,7 +499,6 @@ def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
 
 
 def seconds(time_us: NDArray[np.int64]) -> Array:
-    """Convert microseconds to seconds."""
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 

@@ -18,22 +18,15 @@ _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# Type, default value and length of each field, by topic and field name. A field without default is
-# optional
+# Type, default value (if any) and length of each field, by topic and field name
 TOPIC_FIELDS = table(__file__, "topics.toml", dict[str, dict[str, str]])
 
 
 @dataclass(frozen=True)
 class Topic:
-    """Messages of one instance of a PX4 topic, as arrays by field.
+    """Messages of one instance of a PX4 topic, as arrays by field, shape (n,) or (n, k).
 
-    Attributes
-    ----------
-    name : str
-    fields : mapping from PX4 field name to ndarray
-        Shape (n,) or (n, k) for n messages, in the logged types. The first field is ``timestamp``
-        (µs since boot), which must not decrease.
-    instance : int
+    The first field is ``timestamp`` (µs since boot), which must not decrease.
     """
 
     name: str
@@ -44,13 +37,8 @@ class Topic:
 def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
     """Make a topic with PX4's fields and types, and defaults for missing fields.
 
-    Parameters
-    ----------
-    name : str
-    field_values : mapping
-        Values by field, one per message; a scalar is used for all messages.
-    table_row : str
-        Name in ``topics.toml``, if it differs from the topic name.
+    A scalar value is used for all messages. ``table_row`` is the name in ``topics.toml``, if it
+    differs from the name of the topic.
     """
     known_fields = {"timestamp": "uint64", "timestamp_sample": "uint64"}
     known_fields |= TOPIC_FIELDS[table_row or name]
@@ -76,18 +64,9 @@ def encode(
     info: Mapping[str, int | str],
     start_us: int,
 ) -> bytes:
-    """Encode a ULog file; equal input gives equal bytes.
+    """Encode a ULog file with its messages sorted by timestamp; equal input gives equal bytes.
 
-    Parameters
-    ----------
-    topics : sequence of Topic
-        All messages are sorted by timestamp; messages of one topic keep their order.
-    parameters : mapping
-        An int is written as int32, a float as float32.
-    info : mapping
-        An int is written as uint32.
-    start_us : int
-        Boot time (µs) at which logging starts.
+    ``start_us`` is the boot time (µs) at which logging starts.
     """
     content = [
         ULOG_MAGIC + _ULOG_VERSION,
@@ -103,8 +82,8 @@ def encode(
         else:
             content.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
     for name, value in parameters.items():
-        kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-        content.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
+        kind, struct_code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+        content.append(_keyed_message("P", f"{kind} {name}", struct.pack(struct_code, value)))
     for topic_id, topic in enumerate(topics):
         content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())

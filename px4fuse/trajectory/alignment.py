@@ -21,11 +21,10 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 MIN_EXTENT_FRACTION = 1e-6
 # Minimum extent (m, RMS) of a motion that determines a rotation
 MIN_EXTENT_M = 1e-6
-# Maximum ratio of the residual to the extent of a horizontal motion that determines yaw: pure noise
-# has √2. The standard deviation of the rotation is residual / (extent · √n)
+# Maximum ratio of the residual to the horizontal motion for an estimate of yaw: noise alone has √2
 MAX_PLANE_RATIO = 1.0
-# Maximum ratio of the residual to the extent across a line, for a motion that determines the
-# rotation around the line: pure noise has √6
+# Maximum ratio of the residual to the motion perpendicular to the main direction for an estimate of
+# the full rotation: noise alone has √6
 MAX_LINE_RATIO = 2.0
 
 
@@ -149,11 +148,7 @@ def rms_m(difference_m: Array) -> float:
 def _require_determined(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
-    """Raise TrajectoryError if the motion does not determine the rotation.
-
-    Horizontal motion determines yaw. A full rotation also needs an extent across a line (the second
-    singular value).
-    """
+    """Raise TrajectoryError if the motion is too small to estimate the rotation."""
     estimate_extents = _principal_extents(estimate_m)
     reference_extents = _principal_extents(reference_m)
     if kind == "yaw":
@@ -164,16 +159,17 @@ def _require_determined(
         length = float(np.linalg.norm(reference_extents))
         limit = MAX_PLANE_RATIO
         motion_text = "horizontal motion"
-        alternative = "`alignment` none"
+        alternative = "none"
     else:
+        # motion along a line does not determine the rotation around the line
         length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
-        motion_text = "motion is along a line: the motion across the line"
-        alternative = "`alignment` yaw or none"
+        motion_text = "motion perpendicular to the main direction"
+        alternative = "yaw or none"
     if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
             f"the alignment {kind} cannot be estimated: the {motion_text} is {extent_m:.2g} m "
             f"(RMS), and the residual after alignment is {residual_m:.2g} m",
-            f"Use {alternative}.",
+            f"Use `alignment` {alternative}.",
         )

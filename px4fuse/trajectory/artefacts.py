@@ -1,4 +1,4 @@
-"""Properties of a trajectory that are no errors of its estimator: found before it is scored."""
+"""Detection of constant orientations, frozen poses and other body axes before the evaluation."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -14,8 +14,10 @@ MAX_CONSTANT_ROTATION_RAD = 1e-6
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference in that time
 MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# Minimum constant rotation between two bodies, and maximum RMS deviation from it (rad)
-MIN_BODY_ROTATION_RAD, MAX_BODY_DEVIATION_RAD = np.radians(30.0), np.radians(5.0)
+# Minimum constant rotation (rad) between orientations of different body axes
+MIN_BODY_ROTATION_RAD = np.radians(30.0)
+# Maximum RMS deviation (rad) from the constant rotation between body axes
+MAX_BODY_DEVIATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
 ITERATIONS = 5
 
@@ -35,13 +37,7 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
 def find_frozen_poses(
     estimate: Trajectory, reference: Trajectory, time_offset_s: float
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Find positions that repeat while the reference moves; return also warnings.
-
-    Returns
-    -------
-    is_frozen : ndarray of bool, shape (n,)
-    warnings : tuple of str
-    """
+    """Return a mask of positions that repeat while the reference moves, and warnings."""
     is_frozen, warnings = np.zeros(len(estimate), bool), []
     is_new = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
     for start, end in pairwise([*np.flatnonzero(is_new).tolist(), len(estimate)]):
@@ -66,7 +62,7 @@ def find_frozen_poses(
 
 
 def has_other_body(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
-    """Return True if the orientations differ by a large constant rotation after alignment."""
+    """Return True if the orientations are of different body axes, such as those of a camera."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     difference = aligned_estimate.rotation.inv() * reference.rotation

@@ -13,9 +13,9 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the longest interval of the reference that is interpolated, in median intervals
+# Default of the maximum gap in the reference to interpolate over, in median intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum default (s) of the longest interpolated interval of the reference
+# Lower limit (s) of the default of the maximum gap
 MIN_GAP_LIMIT_S = 0.1
 # Maximum time difference (s) of two poses that are paired: default of the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
@@ -26,20 +26,14 @@ class Association(Record, frozen=True):
 
     Attributes
     ----------
-    method : {"interpolate", "nearest"}
-    poses : int
-        Number of pairs.
     max_gap_s : float
-        Longest interval of the reference that is interpolated; for "nearest" the maximum time
-        difference of a pair.
+        Maximum gap in the reference that is interpolated; for "nearest" the maximum time difference
+        of a pair.
     outside, in_gaps : int
-        Number of unused poses of the estimate: before or after the reference, and in gaps of the
-        reference.
-    coverage_estimate : float
-        Fraction of the poses of the estimate that are used.
-    coverage_reference : float
-        Fraction of the time span of the reference that used poses cover. Intervals between used
-        poses that are longer than five median intervals and 0.5 s do not count.
+        Numbers of unused poses of the estimate: outside the reference, and in its gaps.
+    coverage_estimate, coverage_reference : float
+        Fraction of the poses of the estimate that are used, and of the reference's time span that
+        the used poses cover without long gaps.
     """
 
     method: Method
@@ -120,7 +114,7 @@ def associate(
 
 
 def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
-    """Return the longest interval (s) between successive timestamps that is interpolated."""
+    """Return the default of the maximum gap (s) between timestamps to interpolate over."""
     return max(MAX_GAP_INTERVALS * median_interval(time_s), min_limit_s)
 
 

@@ -35,8 +35,7 @@ from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimat
 MAX_SCALE_ERROR = 0.1
 # Minimum fraction of used poses, and of covered time of the reference, without a warning
 MIN_COVERAGE = 0.5
-# Minimum estimated time offset (s) for a warning that the clocks differ: the lag of a filter is
-# smaller
+# Minimum estimated time offset (s) for a warning that the clocks differ: a filter lags by less
 MIN_DOUBTFUL_OFFSET_S = 0.1
 # Maximum ratio of the pose intervals of reference and estimate: with a larger ratio, reference and
 # estimate are probably interchanged
@@ -223,15 +222,6 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
     exceeds 10 %. The reason for the choice is returned as a sentence.
-
-    Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
-    is aligned in rotation and position, and in scale if it is monocular or the scale factor error
-    exceeds 10 %.
-
-    Parameters
-    ----------
-    estimate, reference : Trajectory
-        Associated trajectories: the same number of poses, at the same times.
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
@@ -384,9 +374,9 @@ def _fit_or_approximate(
 def _move_to_reference_body(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Convert the poses of the estimate to the body of the reference.
+    """Convert the poses of the estimate to the body axes and the origin of the reference.
 
-    The constant rotation and the lever arm between both bodies are estimated, with the alignment.
+    Rotation and lever arm are constant, and are estimated together with the alignment.
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None

@@ -147,9 +147,9 @@ class Trajectory:
     def with_positions(
         self, position_m: Array, world_rotation: Rotation | None = None
     ) -> Trajectory:
-        """Return the trajectory with other positions, rotated, and without reported variances.
+        """Return the trajectory with new positions, and without reported variances.
 
-        ``world_rotation`` is one rotation of the frame, or one rotation for each pose.
+        ``world_rotation``, if given, is applied to the orientations: one rotation, or one per pose.
         """
         rotation = self.rotation
         if rotation is not None and world_rotation is not None:

@@ -60,7 +60,7 @@ def to_matrix(q: Array) -> Array:
 
 
 def rotate(matrices: Array, vectors: Array) -> Array:
-    """Multiply each of n vectors with its matrix, shape (n, 3)."""
+    """Multiply n matrices with n vectors, one by one, shape (n, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", matrices, vectors))
 
 

@@ -164,9 +164,8 @@ def find_pairs(
     delta : Delta
         Distance of a pair; in m it is measured along the path.
     all_pairs : bool
-        True: pair every pose with the pose at the distance nearest to delta, if the difference is
-        at most a tenth of delta. False: pair the end of the previous pair with the first pose that
-        is at least delta away.
+        True: pairs start at every pose and end at the pose nearest to delta. False: pairs start at
+        the end of the previous pair, and end at the first pose that is at least delta away.
 
     Returns
     -------
@@ -229,8 +228,6 @@ def relative_error(
     """
     start, end = find_pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
     analysis_name = f"RPE over {delta}"
-    rotations = get_rotations(aligned_estimate, reference, analysis_name)
-    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
     if not len(start):
         no_pair = Unavailable(
             analysis_name,
@@ -240,38 +237,39 @@ def relative_error(
         return RelativeError(
             delta.value, delta.unit, all_pairs, "reference", no_pair, no_pair, no_pair
         )
-    estimate_motion, reference_motion = (
+    motions = [
         track.position_m[end] - track.position_m[start] for track in (aligned_estimate, reference)
-    )
-    overlap = int(np.median(end - start)) if all_pairs else 1
+    ]
+    rotations = get_rotations(aligned_estimate, reference, analysis_name)
+    rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
-        # without orientations both motions are compared in the frame of the reference
-        translation_m = np.linalg.norm(estimate_motion - reference_motion, axis=1)
-        interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
-        scores = statistics(translation_m), interval_m, rotations
+        rotation_deg = rotations  # both motions are compared in the frame of the reference
     else:
-        estimate_inverse, reference_inverse = (
-            rotation_series[start].inv() for rotation_series in rotations
+        inverses = [rotation[start].inv() for rotation in rotations]
+        motions = [inverse.apply(motion) for inverse, motion in zip(inverses, motions, strict=True)]
+        turn, reference_turn = (
+            inverse * rotation[end] for inverse, rotation in zip(inverses, rotations, strict=True)
         )
-        estimate_motion = estimate_inverse.apply(estimate_motion)
-        reference_motion = reference_inverse.apply(reference_motion)
-        # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
-        translation_m = np.linalg.norm(estimate_motion - reference_motion, axis=1)
-        estimate_rotation = estimate_inverse * rotations[0][end]
-        reference_rotation = reference_inverse * rotations[1][end]
-        rotation_deg = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
-        interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
-        scores = statistics(translation_m), interval_m, statistics(rotation_deg)
-    return RelativeError(delta.value, delta.unit, all_pairs, "reference", *scores)
+        rotation_deg = statistics(np.degrees((reference_turn.inv() * turn).magnitude()))
+    # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
+    translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
+    overlap = int(np.median(end - start)) if all_pairs else 1
+    interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
+    return RelativeError(
+        delta.value,
+        delta.unit,
+        all_pairs,
+        "reference",
+        statistics(translation_m),
+        interval_m,
+        rotation_deg,
+    )
 
 
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the orientations of both trajectories.
-
-    The result is Unavailable if a trajectory has no orientations.
-    """
+    """Return both orientations, or the reason why the score ``analysis_name`` is missing."""
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
     role = "reference" if aligned_estimate.rotation else "estimate"

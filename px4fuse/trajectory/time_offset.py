@@ -37,7 +37,7 @@ SMOOTHING_S = 0.25
 MIN_OVERLAP_S = 5.0
 # Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
-# Minimum fraction of the poses in the time of the shorter trajectory that overlap the other
+# Minimum number of overlapping poses, as fraction of the poses in the time span of the shorter
 # trajectory
 MIN_POSES_FRACTION = 0.3
 # Maximum number of correlation peaks for which the ATE is computed
@@ -50,9 +50,8 @@ FINE_SEARCH_WINDOW_S = 0.1
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of another offset's residual (RMS) to the best offset's residual. With a smaller
-# ratio both offsets fit equally well: 95 % limit for two sets of 80 independent residuals, half a
-# minute of flight (F-test, F = 1.2², 80 and 80 degrees of freedom)
+# Minimum ratio of another offset's residual (RMS) to the best residual for an unambiguous result:
+# 95 % limit of an F-test with 80 independent residuals, half a minute of flight
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit
 MAX_FITTED_POSES = 2000
@@ -60,9 +59,8 @@ MAX_FITTED_POSES = 2000
 MAX_MISFIT = 0.5
 # Ratio of the residual to the extent of the motion below which two fits are equally good
 MIN_MISFIT = 1e-3
-# The free velocity is the component of the velocity that a similarity transform cannot explain:
-# only this component determines the time offset. Minimum free velocity (RMS) as fraction of the
-# speed
+# Minimum free velocity (RMS) as fraction of the speed: this component, which a similarity transform
+# cannot explain, determines the time offset
 MIN_FREE_SPEED_FRACTION = 0.05
 # Minimum correlation of the free velocities of both trajectories, which excludes noise
 MIN_FREE_CORRELATION = 0.5
@@ -94,10 +92,7 @@ class TimeOffset(Record, frozen=True, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the offset (s) to add to the estimate's timestamps according to UNIX time.
-
-    None if a trajectory has no UNIX time.
-    """
+    """Return the time offset (s) of the estimate from the UNIX times of both, if available."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -272,17 +267,10 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
 
 @dataclass(frozen=True)
 class _OffsetFit:
-    """Least-squares fit of the time offset near one correlation peak.
+    """Fit of the trajectory with fewer poses (sparse) to the dense one, near a correlation peak.
 
-    Attributes
-    ----------
-    offset_s : float
-    transform : Transform
-        Transform from the sparse to the dense trajectory.
-    time_s : ndarray, shape (n,)
-        Times of the used poses of the sparse trajectory.
-    aligned_m, target_m : ndarray, shape (n, 3)
-        Positions of the sparse trajectory after alignment, and of the dense trajectory.
+    ``time_s`` and ``aligned_m`` are times and positions of the sparse trajectory after alignment,
+    ``target_m`` the positions of the dense trajectory at these times.
     """
 
     offset_s: float
@@ -316,7 +304,7 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     sparse_velocity = fit.transform.rotation.apply(
         fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
-    # Remove the effect of a time offset that equals a translation, small rotation or scale
+    # Remove the velocity that a translation, a small rotation or a scale factor can explain
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * n, 7)

@@ -20,14 +20,9 @@ PageStatus = Literal["same", "differ", "not compared"]
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Value of a report that a new run of the analysis does not reproduce.
+    """Value of a report that a new run of the analysis does not reproduce ("absent" if missing).
 
-    Attributes
-    ----------
-    path : str
-        Path in the results, for example ``axes.north.filters.kf.nis_mean``.
-    recorded, recomputed : str
-        Value in the report and value of the new run; "absent" if missing.
+    ``path`` is the place in the results, such as ``axes.north.filters.kf.nis_mean``.
     """
 
     path: str
@@ -39,15 +34,8 @@ class Mismatch:
 class PageDifference:
     """Difference between a submitted PDF and the report that px4fuse draws again.
 
-    Attributes
-    ----------
-    page : int
-        Page number from 1; 0 for the whole document.
-    what : str
-        Difference in words, without the page.
-    is_structural : bool
-        True if PDF objects are added or missing, which indicates that another program wrote the
-        file.
+    ``page`` is 0 for the whole document. ``is_structural`` is True if PDF objects are added or
+    missing, which indicates that another program wrote the file.
     """
 
     page: int
@@ -56,7 +44,6 @@ class PageDifference:
 
     @property
     def sentence(self) -> str:
-        """Description of the difference, with the page number in front."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 
@@ -66,26 +53,17 @@ class Verdict:
 
     Attributes
     ----------
-    status : Status
-        Result of comparing the numbers. If the numbers agree, the status is still "cannot verify"
-        in two cases: another program wrote the PDF, or pages differ and the library versions too.
     reasons : tuple of str
         Sentences with the differences, the reason for "cannot verify", or the successful checks.
     with_log : bool
         True if the analysis was repeated on the log.
-    differences : tuple of Mismatch
-        Values that differ.
-    page_status : PageStatus
-        Result of comparing the pages.
-    pages : tuple of PageDifference
-        Differences of the pages.
     redrawn : bytes
-        PDF that px4fuse drew from the repeated analysis, to be read instead of the submitted one;
+        PDF that px4fuse drew from the repeated analysis, to be read instead of the submitted PDF;
         empty if the analysis was not repeated.
     remedy : str
-        Action of the user if the report was not verified, one sentence.
+        Action of the user if the report was not verified.
     missing : str
-        Name of a missing log or other input file; else empty.
+        Name of a missing log or other input file.
     """
 
     status: Status

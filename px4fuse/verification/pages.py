@@ -46,8 +46,8 @@ from px4fuse.verification.pdf_input import (
     resolve_reference,
 )
 
-# Maximum difference (pt) of coordinates that count as equal: different OpenBLAS kernels move points
-# by at most 0.07 pt, and 0.25 pt is not visible
+# Tolerance (pt) of coordinates: different OpenBLAS kernels move points by at most 0.07 pt, and
+# 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
 # Relative and absolute tolerance of PDF numbers that are not coordinates: other programs save them
 # as 32-bit floats
@@ -75,16 +75,16 @@ MAX_XMP_BYTES = 100_000
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
-    "/AA": "an automatic action",
+    "/AA": "an action that a viewer runs automatically",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
     "/CropBox": "a crop box",
     "/OCProperties": "layers",
-    "/OpenAction": "an automatic action",
+    "/OpenAction": "an action that a viewer runs automatically",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "a unit of length",
-    "/XObject": "a picture or form",
+    "/UserUnit": "another unit of length for a page",
+    "/XObject": "an image or form object",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
 _TOKEN = re.compile(
@@ -121,18 +121,9 @@ def compare_pages(
 ) -> tuple[PageDifference, ...]:
     """Compare a submitted PDF with the redrawn report, in a process with limits.
 
-    Parameters
-    ----------
-    submitted_pdf : bytes
-        PDF that :func:`px4fuse.verification.pdf_input.read_report` accepted.
-    is_same_text : callable
-        Returns True if two texts are equal up to the rounding of a number.
-
-    Returns
-    -------
-    tuple of PageDifference
-        At most MAX_LISTED_DIFFERENCES, in page order; empty if the PDF is as px4fuse writes it. If
-        the comparison exceeds its limits, this is the only difference.
+    ``is_same_text`` returns True if two texts are equal up to the rounding of a number. At most
+    MAX_LISTED_DIFFERENCES are returned, in page order. If the comparison exceeds its limits, this
+    is the only difference.
     """
     job = submitted_pdf, redrawn_pdf, is_same_text
     differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
@@ -147,10 +138,10 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
             submitted_pdf, redrawn_pdf = map(open_strictly, (submitted, redrawn))
-            found = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
+            page_differences = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
             differences = [
                 *(PageDifference(0, ambiguity, True) for ambiguity in _ambiguities(submitted)),
-                *islice(found, MAX_LISTED_DIFFERENCES),
+                *islice(page_differences, MAX_LISTED_DIFFERENCES),
             ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
             if producer is not None and any(difference.is_structural for difference in differences):
@@ -165,25 +156,16 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
 
 @dataclass
 class _PdfComparison:
-    """Pairwise comparison of all objects of two PDFs.
-
-    Attributes
-    ----------
-    compared : set of tuple
-        Compared pairs: object number and generation in the submitted PDF, and object number in the
-        redrawn one.
-    parents : list of tuple
-        Parents of pages, which are compared after the document catalogue.
-    fonts : mapping
-        Fonts of the current page, by their names in the page content.
-    value_count : int
-        Number of compared values; limited, because a malicious PDF may contain very many.
-    """
+    """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    compared: set[tuple[int, int, int]] = field(default_factory=set)
-    parents: list[tuple[Any, Any, str]] = field(default_factory=list)
+    # object number and generation in the submitted PDF, and object number in the redrawn PDF
+    compared_pairs: set[tuple[int, int, int]] = field(default_factory=set)
+    # parents of pages, which are compared after the document catalogue
+    parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
+    # fonts of the current page, by their names in the page content
     fonts: Mapping[str, Any] = field(default_factory=dict)
+    # number of compared values, which is limited because a malicious PDF may contain very many
     value_count: int = 0
 
     def differences(
@@ -193,16 +175,18 @@ class _PdfComparison:
         pages = [_page_references(reader) for reader in (submitted, redrawn)]
         for number, (page, expected) in enumerate(zip_longest(*pages), start=1):
             if page is None or expected is None:
-                excess = f"px4fuse draws only {len(pages[1])} pages"
-                yield PageDifference(number, "the page is missing" if page is None else excess)
+                fault = "the page is missing"
+                if expected is None:
+                    fault = f"px4fuse draws only {len(pages[1])} pages"
+                yield PageDifference(number, fault)
                 return
             self.fonts = resolve_reference(expected.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(page, expected, "/Page", number)
         for key in ("/Info", "/Root"):
             value, expected = (dict.get(reader.trailer, key) for reader in (submitted, redrawn))
             yield from self._compare(value, expected, key, 0)
-        for parents in self.parents:
-            yield from self._compare(*parents, 0)
+        for pair in self.parent_pairs:
+            yield from self._compare(*pair, 0)
         # programs that support PDF 1.4 and PDF 1.5 read different cross-reference tables
         if "/XRefStm" in submitted.trailer:
             yield PageDifference(0, "the file has a second table of objects", True)
@@ -224,9 +208,9 @@ class _PdfComparison:
                     )
                 if isinstance(redrawn_value, IndirectObject):
                     pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
-                    if pair in self.compared:
+                    if pair in self.compared_pairs:
                         continue
-                    self.compared.add(pair)
+                    self.compared_pairs.add(pair)
             submitted_value, redrawn_value = map(
                 resolve_reference, (submitted_value, redrawn_value)
             )
@@ -240,8 +224,11 @@ class _PdfComparison:
                 )
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
-                    lengths = f"{len(submitted_value)} elements, not {len(redrawn_value)}"
-                    yield PageDifference(page, f"the PDF array {key} has {lengths}", True)
+                    description = (
+                        f"the PDF array {key} has {len(submitted_value)} elements instead of "
+                        f"{len(redrawn_value)}"
+                    )
+                    yield PageDifference(page, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
                 remaining_values += [(*pair, key) for pair in pairs][::-1]
@@ -274,7 +261,7 @@ class _PdfComparison:
             yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
-            (self.parents if page and name == "/Parent" else remaining_values).append(pair)
+            (self.parent_pairs if page and name == "/Parent" else remaining_values).append(pair)
         if isinstance(submitted_dictionary, StreamObject) and isinstance(
             redrawn_dictionary, StreamObject
         ):
@@ -348,12 +335,12 @@ class _PdfComparison:
     def _text(self, operands: tuple[Operand, ...], font: str) -> str:
         """Decode the text of a Tj or TJ operation with the font's ToUnicode map; ? if unknown."""
         cmap = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
-        letters = {
+        text_by_glyph = {
             int(glyph, 16): bytes.fromhex(text) for glyph, text in _TO_UNICODE_ENTRY.findall(cmap)
         }
         glyphs = b"".join(operand for operand in operands if isinstance(operand, bytes))
         numbers = struct.unpack(f">{len(glyphs) // 2}H", glyphs[: len(glyphs) // 2 * 2])
-        text = b"".join(letters.get(number, b"\0?") for number in numbers)
+        text = b"".join(text_by_glyph.get(number, b"\0?") for number in numbers)
         return text.decode("utf-16-be", "replace")
 
 
@@ -364,8 +351,8 @@ def _ambiguities(pdf: bytes) -> Iterator[str]:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
         # the end of the file must refer to the first cross-reference table
-        begin = pdf.find(b"endobj") + len(b"endobj")
-        if pdf[begin : int(end[1])].strip():
+        table_start = pdf.find(b"endobj") + len(b"endobj")
+        if pdf[table_start : int(end[1])].strip():
             yield "the file has a second table of objects"
 
 
@@ -438,7 +425,7 @@ def _unescaped(match: re.Match[str]) -> str:
 def _has_near_operands(
     operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
 ) -> bool:
-    """Return True if operands are equal, coordinates within COORDINATE_TOLERANCE_PT."""
+    """Return True if the operands of a drawing operator are equal within the tolerances."""
     if len(submitted_operands) != len(redrawn_operands):
         return False
     first_coordinate = _FIRST_COORDINATE.get(operator, len(redrawn_operands))

@@ -41,7 +41,7 @@ MAX_MISSING_OBJECTS = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
-_COSTLY_REASON = "reading the PDF takes more memory or time than reading a report."
+_COSTLY_REASON = "the PDF needs more memory or time to read than a report of px4fuse."
 
 # Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test of 900 PDFs with
 # changed bytes. Other exceptions are errors of px4fuse and are not caught
@@ -145,15 +145,14 @@ def _check_file(pdf: bytes) -> None:
             not pdf.startswith(b"%PDF-"),
             "the file is not a PDF. Hand in the file that px4fuse wrote.",
         ),
-        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
+        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand in the complete file."),
     ):
         if has_problem:
             raise ResultsError(reason)
     # every stream is inflated and discarded here, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # data of a stream may contain the word "stream", so each occurrence counts towards the
-        # limit
+        # each occurrence of the word "stream" is tested, also inside of the data of a stream
         inflated_bytes = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
         remaining_bytes -= inflated_bytes
         if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
@@ -164,9 +163,10 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Return the larger size (bytes) of the zlib data at ``start``: compressed or inflated.
+    """Measure the cost of inflating the zlib data at ``start``, up to ``limit`` + 1.
 
-    The result is 0 without zlib data, otherwise at least 1000 and at most ``limit`` + 1.
+    The cost is the compressed or the inflated size (bytes), whichever is larger, or at least 1000.
+    It is 0 if there are no zlib data.
     """
     header = pdf[start : start + 2]
     if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
@@ -266,7 +266,8 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
         objects = map(resolve_reference, contents)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
     if features:
-        raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike all reports.")
+        feature_names = ", ".join(sorted(features))
+        raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")
     if not files and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "

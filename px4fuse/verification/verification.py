@@ -1,15 +1,14 @@
 """Verification: repeat the analysis of a report on its log, and compare numbers and pages.
 
-The recorded command is run again on the log, which is found by its SHA-256, and the results are
-compared with the results attached to the PDF. This confirms that the numbers follow from the log.
-It does not confirm the author: each person with the log can make the same report under another
-name.
+The results of the new run are compared with the results attached to the PDF. This confirms that the
+numbers follow from the log. It does not confirm the author: each person with the log can make the
+same report under another name.
 
 The report is drawn again from the new results, and the submitted PDF is compared with it
 (:mod:`px4fuse.verification.pages`). No number is read from the submitted pages.
 
-The recorded request may be forged: it is decoded strictly, all values are checked for their ranges,
-files are found by SHA-256 and never by name, and it cannot name an output file.
+The recorded request may be forged. It is decoded strictly with the ranges of all values, and it
+cannot name an output file. Input files are found by SHA-256, never by name.
 """
 
 import re
@@ -46,17 +45,15 @@ LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Maximum relative difference of numbers that count as equal. On another processor, sums over a
-# flight differ in the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS
-# kernels differ by at most 3e-8 (six flights)
+# Relative tolerance of numbers: the results of four OpenBLAS kernels differ by at most 3e-8 (six
+# flights)
 RELATIVE_TOLERANCE = 1e-6
-# Maximum absolute difference of numbers near zero that count as equal
+# Absolute tolerance of numbers near zero
 ABSOLUTE_TOLERANCE = 1e-9
-# Maximum relative difference of estimates that count as equal. The minimum of the cost is flat: if
-# the cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends of its
-# 95 % interval in the 4th. Pages print up to three digits
+# Relative tolerance of estimates. The minimum of the cost is flat: if the cost differs in its 12th
+# digit, the ends of the 95 % interval differ in the 4th digit. Pages print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Maximum absolute difference of estimates near zero that count as equal
+# Absolute tolerance of estimates near zero
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Beginnings of the paths of estimates in the results
 ESTIMATE_PATHS = (
@@ -98,22 +95,20 @@ class NotRepeatableError(Exception):
 
 
 def log_sha256(results: ReportedResults) -> str:
-    """Return the SHA-256 of the log that a report analyses."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
 def log_name(results: ReportedResults) -> str:
-    """Return the file name of the log that a report analyses."""
     if isinstance(results, LoopResults):
         return split_track(results.track.name)[0]
     return results.log.name
 
 
 def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
-    """Repeat the analysis that a report records, on the files in ``logs`` (by SHA-256).
+    """Repeat the analysis of a report on the files in ``logs`` (by SHA-256).
 
-    Returns the verdict "cannot verify" if px4fuse cannot have written the recorded command, a file
-    is missing, or the analysis fails.
+    Return the verdict "cannot verify" if the recorded command is not possible, a file is missing,
+    or the analysis fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -164,8 +159,8 @@ def split_track(source: str) -> tuple[str, str]:
     """Split ``LOG:vio`` into the file ``LOG`` and the track ``:vio``, which may be missing."""
     from px4fuse.loop.tracks import TRACK_NAMES  # noqa: PLC0415
 
-    name, colon, tail = source.rpartition(":")
-    return (name, f":{tail}") if colon and tail in TRACK_NAMES else (source, "")
+    name, separator, track = source.rpartition(":")
+    return (name, f":{track}") if separator and track in TRACK_NAMES else (source, "")
 
 
 def _repeat_comparison(
@@ -235,20 +230,15 @@ def verify(
     pdf : bytes
         Content of the report file.
     logs : mapping of str to Path
-        Logs and other recordings by SHA-256.
+        Logs and other input files by SHA-256.
     recompute : callable
         Function that repeats the analysis.
-
-    Returns
-    -------
-    Verdict
-        "verified" only if the analysis was repeated on the log and all numbers agree.
     """
     version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
     if version != own_version:
         version = one_line(version, 40)
         reason = f"the report was made with px4fuse {version}; this is px4fuse {own_version}"
-        return cannot_verify(reason, f"Verify it with px4fuse {version}.")
+        return cannot_verify(reason, f"Verify the report with px4fuse {version}.")
     name = one_line(log_name(results), 80) or "the log"
     if not logs:
         return cannot_verify(NO_LOG_REASON, f"Add {name} to --logs.", name)
@@ -305,6 +295,7 @@ def _verify_with_log(
     other_libraries = (
         {*submitted_results.provenance.libraries.items()} - {*own_libraries} if pages else ()
     )
+    # pages of another program, or drawn with other library versions, may differ anyway
     is_comparable = not (is_foreign or other_libraries)
     page_status: PageStatus = "same"
     if pages:
@@ -324,7 +315,7 @@ def _verify_with_log(
     if other_libraries:  # other library versions may draw other pages
         versions = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(f"the report was made with {versions}; this computer has other versions")
-        remedy = remedy or f"Verify it with {versions}."
+        remedy = remedy or f"Verify the report with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
     listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
     return Verdict(
@@ -333,13 +324,13 @@ def _verify_with_log(
 
 
 def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
-    """Return True if a printed number and its redrawn number are roundings of one pair of results.
+    """Return True if two printed numbers differ only because equal results were rounded.
 
-    A pair contains a recorded and a recomputed result that are equal within the tolerances.
+    ``pairs`` are recorded and recomputed results that are equal within the tolerances.
     """
-    decimals, printed = _decimal_count(number), (float(number), float(redrawn))
+    decimals, printed_pair = _decimal_count(number), (float(number), float(redrawn))
     return decimals == _decimal_count(redrawn) and any(
-        printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
+        printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
         for a, b in pairs
     )
@@ -425,7 +416,6 @@ def _is_near(path: str, submitted_number: float, new_number: float, is_estimate:
 
 
 def _is_same(submitted_value: Any, new_value: Any, is_same_number: TextComparison) -> bool:
-    """Return True if two values are equal, texts up to the rounding of their numbers."""
     if isinstance(submitted_value, str) and isinstance(new_value, str):
         return is_same_text_rounded(submitted_value, clean_text(new_value), is_same_number)
     return type(submitted_value) is type(new_value) and bool(submitted_value == new_value)

@@ -86,7 +86,6 @@ class AnswerKey(msgspec.Struct, frozen=True):
 
 
 def key_text(key: AnswerKey) -> str:
-    """Format the answer key as JSON with line breaks."""
     return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 

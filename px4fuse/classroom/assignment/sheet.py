@@ -80,7 +80,7 @@ def read_sheet(path: Path) -> Sheet:
         size_remedy="Give a CSV table of one class.",
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
-        raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")
+        raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save the table as CSV.")
     encoding = "utf-8-sig" if content.startswith(codecs.BOM_UTF8) else "utf-8"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"

@@ -41,9 +41,9 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 SIZE_TOLERANCE = 0.15
 # Tolerance (m) of the loop closure error in a right answer
 CLOSURE_TOLERANCE_M = 0.3
-# Minimum fraction of samples rejected by EKF2, for which a right answer must name rejections
+# Minimum fraction of samples rejected by EKF2 for which the student must name rejections
 MIN_REJECTED_FRACTION = 0.005
-# Minimum position reset of EKF2 (m) that a right answer must name
+# Minimum size (m) of a position reset of EKF2 that the student must name
 MIN_RESET_M = 0.2
 # Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
 EKF2_START_S = 5.0
@@ -168,7 +168,7 @@ def draw_predictions(
                     continue
                 text = f"{quantity} of {name.upper()} {change}"
                 right_index = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
-                # the value is not near a limit of the right range
+                # keep the value away from the limits of the right range
                 value_index = right_index - 0.2 - 0.6 * draw_number(f"place {text}")
                 first, second, third, fourth = (
                     value * PREDICTION_RANGE_FACTOR ** (index - value_index) for index in range(4)

@@ -115,7 +115,6 @@ class CheckInput:
 
     @property
     def comparison(self) -> ComparisonResults:
-        """Results of a compare report."""
         assert isinstance(self.results, ComparisonResults)
         return self.results
 
@@ -181,7 +180,6 @@ class CheckInput:
         return form_points(self.form, self.answer.form)
 
     def has_finding(self, *ids: str) -> bool:
-        """Return True if the report contains a finding with one of these ids."""
         return any(finding.id in ids for finding in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
@@ -207,7 +205,6 @@ def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
 
 
 def shorten_text(value: str) -> str:
-    """Shorten a text to one line of MAX_QUOTE_LENGTH characters, without control characters."""
     return one_line(value, MAX_QUOTE_LENGTH)
 
 
@@ -453,7 +450,7 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
 # Maximum distance (m) between take-off and landing place of a closed loop
 MAX_CLOSED_LOOP_M = 0.5
-# Fraction of the points for the condition on the ATE if a report without reference has no ATE
+# Fraction of the points for a smaller ATE if the report has no reference for computing an ATE
 NO_REFERENCE_FRACTION = 0.5
 
 

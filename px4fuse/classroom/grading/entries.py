@@ -129,8 +129,7 @@ class Course:
         return Register(people, *people_by_sheet)
 
 
-# Report of a student: sort key (submission time, time of the zip entry), graded report, and row of
-# the class table if only this report counts
+# Sort key of a report (submission time, time of the zip entry), report, and row of the class table
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -294,7 +293,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     eligible = without_action or with_report or sorted_attempts
     chosen_key, chosen_report, entry = {
         "latest": eligible[-1],
-        # the first submission may contain several reports: the report with the most points
+        # if the first submission contains several reports, the report with most points is used
         "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
         "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]

@@ -127,8 +127,8 @@ def _student_key(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# Checks for equal contents of two reports: text of the flag, function that returns the compared
-# content, and function that returns an owner. Two reports of one owner are not compared
+# Checks for equal contents of two reports: text of the flag, functions that return the compared
+# content and the owner of a report. Reports of the same owner are not compared
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (

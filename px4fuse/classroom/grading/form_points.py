@@ -89,7 +89,6 @@ class FormPoints:
 
     @property
     def fraction(self) -> float:
-        """Sum of the points divided by the maximum, 0 to 1."""
         return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
 
 
@@ -132,8 +131,7 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     return FormPoints(points_by_part, weights, feedback, is_kind_named)
 
 
-# Injected fault of the flight, best matching injected fault in the answer form, and fraction of the
-# points
+# Injected fault, matching fault in the answer form (if any), and fraction of the points
 Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
@@ -275,7 +273,6 @@ def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistak
 
 
 def panels(kind: str) -> list[str]:
-    """Return the panels of the report that show a kind of injected fault."""
     return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
 
 

@@ -44,7 +44,6 @@ class GradeOutcome:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        """All reports by student; the first report of each student counts."""
         return tuple(report for entry in self.entries for report in entry.reports)
 
 

@@ -22,10 +22,9 @@ class ItemStatistics:
     ----------
     fractions : tuple of float
         Points of each report divided by the maximum; for a fault 1 if the form names it, else 0.
-    max_points : float
     discrimination : float or None
         Correlation with the other points of the same reports (point-biserial for a fault). A value
-        near 0 or below shows that good students do not get more points here than others.
+        near 0 or below means that good students do not get more points here than others.
     """
 
     title: str
@@ -46,11 +45,11 @@ class ItemStatistics:
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
-    """Compute the statistics of all items, without reports that need a decision of the instructor.
+    """Compute statistics of rubric items, parts of the answer form, and faults, in this order.
 
-    Rubric items are first, then parts of the answer form, then injected faults.
+    Reports that need a decision of the instructor do not count.
     """
-    points: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
+    rows_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
         if report.instructor_action:
             continue
@@ -61,11 +60,11 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             total = sum(item.points for item in items)
             for item in items:
                 row = item.points, item.max_points, total - item.points
-                points[place, f"{prefix}{item.title}"].append(row)
+                rows_by_item[place, f"{prefix}{item.title}"].append(row)
         for kind, is_named in report.mistakes.items():
-            points[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+            rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
-    for (_, title), rows in sorted(points.items(), key=lambda item: item[0][0]):
+    for (_, title), rows in sorted(rows_by_item.items(), key=lambda item: item[0][0]):
         item_points, max_points, other_points = np.transpose(rows)
         discrimination = None
         if len(rows) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):

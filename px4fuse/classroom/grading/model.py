@@ -141,7 +141,6 @@ class GradedReport:
 
     @property
     def awaits_points(self) -> bool:
-        """True if the instructor has not scored an item yet."""
         return any(item.awaits_points for item in self.items)
 
     @property
@@ -156,7 +155,6 @@ class GradedReport:
 
     @property
     def max_points(self) -> float:
-        """Sum of the maximum points of all items."""
         return sum(item.max_points for item in self.items)
 
 
@@ -203,12 +201,10 @@ class Entry:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        """Reports of the student; the first one counts."""
         return (*([self.counted_report] if self.counted_report else []), *self.other_reports)
 
     @property
     def display_name(self) -> str:
-        """Name of the student, else id."""
         return self.student or self.student_id or "no name"
 
 

@@ -15,7 +15,7 @@ Question = tuple[str, str]
 
 
 def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
-    """Format the questions to all students with an answer form, each with the expected answer."""
+    """Format questions and expected answers for each student with an answer form."""
     lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
     for entry in entries:
         report = entry.counted_report
@@ -32,20 +32,21 @@ def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
 
 def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
     """Yield questions on a completed form: errors first, then right answers and the verdict."""
-    named = {mistake.kind: mistake for mistake in form.mistakes}
+    named_kinds = [mistake.kind for mistake in form.mistakes]
     true_kinds = [mistake.kind for mistake in truth.mistakes]
     flight_text = ", ".join(true_kinds) or "no fault"
-    for kind in named:
+    for kind in named_kinds:
         if kind in (*true_kinds, NO_MISTAKE_KIND):
             continue
         yield (
             f"You named {kind} ({MISTAKES[kind].description}). Which panel would show this fault, "
             "and does the panel of your report show it?",
-            f"{' or '.join(panels(kind))}; it does not show it. The flight has {flight_text}.",
+            f"{' or '.join(panels(kind))}. The panel does not show the fault. The flight has "
+            f"{flight_text}.",
         )
     for mistake in truth.mistakes:
-        description, student_mistake = MISTAKES[mistake.kind].description, named.get(mistake.kind)
-        if student_mistake is None:
+        description = MISTAKES[mistake.kind].description
+        if mistake.kind not in named_kinds:
             yield (
                 f"Your flight also has this fault: {description}. Show it in your report, and "
                 "state its size and time.",
@@ -68,14 +69,15 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             f"Range {right_range} is right. The reason names what the change does to the "
             "innovations, and to R or Q.",
         )
-    for name, given, verdict in (
+    for filter_name, given_verdict, true_verdict in (
         ("KF", form.verdict_kf, truth.kf),
         ("EKF2", form.verdict_ekf2, truth.ekf2),
     ):
-        factor = verdict.factor
+        factor = true_verdict.factor
         factor_text = "" if factor is None else f" (σ is wrong by a factor of {factor:.2g})"
         yield (
-            f"Your verdict on {name} is: {given or 'blank'}. Which number of the report shows it?",
-            f"{verdict.verdict or 'No verdict is possible'}{factor_text}: the mean NIS, and the "
-            "ratio of the errors to the reported σ.",
+            f"Your verdict on {filter_name} is: {given_verdict or 'blank'}. Which number of the "
+            "report shows it?",
+            f"{true_verdict.verdict or 'No verdict is possible'}{factor_text}: the mean NIS, and "
+            "the ratio of the errors to the reported σ.",
         )

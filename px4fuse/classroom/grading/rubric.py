@@ -93,7 +93,6 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def rubric_text() -> str:
-    """Return the default rubric (TOML) with its comments, as an example to edit."""
     return files("px4fuse.classroom.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
 
 
@@ -111,7 +110,6 @@ def read_rubric(path: Path | None) -> Rubric:
 
 
 def parse_rubric(text: str, source_name: str) -> Rubric:
-    """Parse and check the text of a rubric; ``source_name`` is its name in errors."""
     try:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
     # tomllib raises ValueError for a syntax error, and for an integer with very many digits

@@ -340,7 +340,6 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _short_name(name: str) -> str:
-    """Format a file name on one line; shorten a long name in the middle."""
     line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
     if len(line) > MAX_NAME_LENGTH:
         half_length = MAX_NAME_LENGTH // 2
@@ -410,7 +409,6 @@ def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
 
 
 def _yaml_value(block: str, key: str) -> str:
-    """Return the value of the first line with a YAML key, without quotes."""
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 

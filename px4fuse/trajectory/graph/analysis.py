@@ -57,19 +57,9 @@ def analyse_graph(
 ) -> tuple[Graph, PoseGraph]:
     """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
-    Edges between successive vertices are odometry, all other edges are closures.
-
-    Parameters
-    ----------
-    name : str
-        Name of the graph.
-    run_robust : bool, optional
-        True for robust optimisation, too; by default True with up to 1000 closures.
-
-    Returns
-    -------
-    (Graph, PoseGraph)
-        Results, and the pose graph with the poses of the solution with all closures.
+    Edges between successive vertices are odometry, all other edges are closures. ``run_robust``
+    is by default True with up to 1000 closures. Return also the pose graph with the poses of the
+    least-squares solution.
 
     Raises
     ------

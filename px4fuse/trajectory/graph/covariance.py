@@ -45,23 +45,9 @@ class GateResult(Record, frozen=True):
 def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
     """Test closures against odometry alone, before the optimisation uses them.
 
-    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r``. r is the log of the inverse closure times the relative
-    pose from odometry, J the inverse right Jacobian at r, Omega the information of the closure, and
-    Sigma the covariance of the relative pose. For Sigma the error of each odometry edge is
-    transformed to the second vertex by the adjoint (Barfoot 2017, 8.96 and the first order of
-    8.108, with right perturbations). Only directions in which the closure has information are used.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Edges between successive poses are odometry, except the tested edges.
-    edge_indices : sequence of int
-        Indices of the edges to test.
-
-    Returns
-    -------
-    list of GateResult
-        Test results in the order of ``edge_indices``.
+    The test statistic is the squared Mahalanobis distance between a closure and the relative pose
+    from odometry, whose covariance is propagated by the adjoint (Barfoot 2017, 8.96 and the first
+    order of 8.108). All edges between successive poses are odometry, except the tested edges.
 
     Raises
     ------

@@ -13,23 +13,10 @@ from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equat
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses from the edges without changing the first pose.
+    """Compute initial poses from the edges; the first pose is unchanged.
 
     The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
-    SLAM, section IV-C). Rotation matrices are fitted by linear least squares without the rotation
-    constraint and projected to rotations, then translations are fitted by linear least squares. If
-    odometry connects all poses and composing its edges gives a lower cost, that result is used
-    instead.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Pose graph. Of its poses, only the first is used.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with initial poses; ``initialised`` contains the method.
+    SLAM, section IV-C), or the composition of the odometry edges if its cost is lower.
 
     Raises
     ------
@@ -41,21 +28,12 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _chordal(graph), key=model.cost)
-    except (
-        TrajectoryError
-    ):  # Some edges have no rotation; the composed odometry edges determine all poses
+    except TrajectoryError:  # some edges have no rotation
         return composed_graph
 
 
 def _chordal(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses by chordal initialisation.
-
-    Raises
-    ------
-    TrajectoryError
-        Edges with rotation information do not connect all poses, or the edges do not determine all
-        poses.
-    """
+    """Fit rotation matrices and then translations, both by linear least squares."""
     d = graph.dimension
     rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
     model.require_connected(graph, rotation_information > 0.0, "edges that measure rotation")
@@ -95,10 +73,7 @@ def _solve_positions(
     value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve :func:`normal_equations` by least squares.
-
-    The result has the shape (n, d, k).
-    """
+    """Solve :func:`normal_equations`; the result has the shape (n, d, k)."""
     solution = solve_normal_equations(
         *normal_equations(
             graph, first_coefficient, second_coefficient, information, value, first_pose

@@ -147,17 +147,8 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
     """Raise TrajectoryError if the graph is not connected.
 
-    Parameters
-    ----------
-    is_used : ndarray of bool, shape (m,)
-        Mask of the edges that may connect poses. Edges without information never connect poses.
-    edges_name : str
-        Name of the used edges in the message, for example "the edges".
-
-    Raises
-    ------
-    TrajectoryError
-        The message contains the number of separate parts and a vertex that is not connected.
+    Only edges in the mask ``is_used`` that have information connect poses. ``edges_name`` is the
+    name of these edges in the message.
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
@@ -182,14 +173,9 @@ def compose_odometry(graph: PoseGraph) -> PoseGraph:
 
 
 def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
-    """Return the index of the odometry edge from each pose to the next, shape (n - 1,).
+    """Return the index of the odometry edge from each pose to the next, or -1, shape (n - 1,).
 
-    The index is -1 without such an edge. Of several edges between two poses the first is used.
-
-    Parameters
-    ----------
-    excluded_edges : ndarray of int, optional
-        Indices of edges that are not used.
+    Of several edges between two poses the first is used.
     """
     odometry_edges = np.flatnonzero(graph.is_successive)
     if excluded_edges is not None:
@@ -204,13 +190,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
 
 def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
-    """Return the relative poses along a chain of edges, shape (k, 3) or (k, 7).
-
-    Parameters
-    ----------
-    chain : ndarray of int, shape (k,)
-        Indices of edges between successive poses, in order.
-    """
+    """Return the relative poses of a chain of edges between successive poses."""
     steps = graph.measurements[chain].copy()
     is_backward = graph.first[chain] > graph.second[chain]
     steps[is_backward] = lie.inverse(steps[is_backward])

@@ -55,8 +55,7 @@ class Solution(Record, frozen=True, kw_only=True):
     iterations : int
         Number of accepted steps, over all starts and stages.
     converged : bool
-        False if the maximum number of iterations was reached, or if no further step decreased the
-        cost although the last step still changed it by more than the tolerance.
+        True if the last step changed the cost by less than the tolerance.
     dropped : int
         Number of edges with a weight below 0.5.
     poses : ndarray, shape (n, 3) or (n, 7)
@@ -84,26 +83,17 @@ class _Minimum:
 def solve(
     graph: PoseGraph, *, robust: bool = False, is_closure: BoolArray | None = None
 ) -> Solution:
-    """Optimise the poses by Levenberg-Marquardt, as GTSAM does.
+    """Optimise the poses by Levenberg-Marquardt; the first pose is fixed.
 
-    The first pose is fixed. Steps, damping (identity, from 1e-5, by factors of 10) and acceptance
-    of steps are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and GTSAM reach the same
-    minimum from the same start. The tolerances are 1e-10, relative and absolute.
-
-    ``robust`` minimises truncated least squares by graduated non-convexity (Yang 2020, eq. 13
-    and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). The truncation
-    is at the 99 % point of chi-square, with the rank of the closure's information as degrees of
-    freedom. The optimisation runs from the least-squares solution and from the initial poses, and
-    the result with the lower cost is used. In this cost a dropped closure costs the 99.9 % point of
-    chi-square, the limit of the gate. Finally up to 20 dropped closures are restored one by one if
-    that lowers the cost. Final weights are 0 or 1.
+    Steps, damping and acceptance are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and
+    GTSAM reach the same minimum from the same start.
 
     Parameters
     ----------
     robust : bool
+        True to drop false closures, by graduated non-convexity.
     is_closure : ndarray of bool, shape (m,), optional
-        Mask of the edges that may be false; all other edges have weight 1. By default all edges
-        between poses that are not successive.
+        Mask of the edges that may be false; default: edges between poses that are not successive.
 
     Raises
     ------
@@ -191,9 +181,9 @@ def _minimise(
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Minimise truncated least squares from two starts.
+    """Minimise truncated least squares from two starts, and use the result with the lower cost.
 
-    Only edges that may be false (``is_doubtful``) are truncated.
+    Then dropped closures are restored one by one, if that lowers the cost.
     """
     _, scaled_information = model.scale_to_unit_diagonal(graph.information)
     degrees_of_freedom = np.sum(

@@ -1,0 +1,238 @@
+"""Command ``px4fuse mcp``: serves the other commands as tools of the Model Context Protocol."""
+
+import gc
+import io
+import json
+import os
+import signal
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args
+
+import click
+
+from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
+from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
+from px4fuse.errors import SettingsError
+
+# Names of arguments of tools that differ from the names of the parameters of commands
+ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
+# Parameters of commands that are no arguments of tools: outputs, exit codes and the student
+HIDDEN = {
+    *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
+    *("student", "student_id", "notes", "answers"),
+}
+
+
+@click.command()
+@click.option(
+    "--root",
+    "roots",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    metavar="DIR",
+    multiple=True,
+    default=(".",),
+    help="Folder whose files the tools may read, with its subfolders; repeatable.",
+)
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Folder for the reports (PDF) of the tools.  [default: no file is written]",
+)
+@options.timeout_option
+@options.memory_option
+@options.max_size_option
+def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: float) -> None:
+    """Serve px4fuse to assistants (Model Context Protocol).
+
+    An assistant program starts this command, and exchanges messages with it on standard input and
+    output. The tools run other commands of px4fuse, for example compare and whatif, one at a time.
+    """
+    if find_spec("mcp") is None:
+        raise SettingsError(
+            "px4fuse mcp requires the package mcp.", 'Run pip install "px4fuse[mcp]".'
+        )
+    from px4fuse.mcp.server import Server
+
+    gc.enable()  # the server runs for a long time
+    for signal_number in TERMINATION_SIGNALS:
+        # no exception, because the thread that reads standard input would not end
+        signal.signal(signal_number, lambda number, _: os._exit(128 + number))
+    folders = tuple(root.resolve() for root in roots)
+    if out is not None:
+        out = out.resolve()
+        out.mkdir(parents=True, exist_ok=True)
+    run = partial(run_command, folders, max_log_bytes.get(), out)
+    server = Server(make_tools(folders), run, timeout_s, int(memory_gb * 1e9))
+    try:
+        server.run()
+    except* BrokenPipeError:  # the client has ended
+        pass
+
+
+def run_command(
+    folders: tuple[Path, ...],
+    max_bytes: int,
+    out: Path | None,
+    sender: Connection | None,
+    words: Sequence[str],
+) -> tuple[str, Any]:
+    """Run a command in this process; return its terminal text, and its results or None.
+
+    Parameters
+    ----------
+    folders : tuple of Path
+        Folders from which files may be read.
+    max_bytes : int
+        Maximum size of a log (bytes).
+    out : Path or None
+        Current folder of the command, in which it writes reports.
+    sender : Connection or None
+        Connection to which the activities of the command are sent.
+    words : sequence of str
+        Command line, without ``px4fuse``.
+    """
+    readable_folders.set(folders)
+    max_log_bytes.set(max_bytes)
+    if out and sender:  # the server itself writes nothing
+        os.chdir(out)
+    text, results = io.StringIO(), list[str]()
+    try:
+        with redirect_stdout(text), redirect_stderr(io.StringIO()):
+            # with "-" the command makes no report
+            defaults = {words[0]: {"json_path": None if out else "-"}}
+            with cli.make_context("px4fuse", [*words], default_map=defaults) as context:
+                context.meta[outputs.SEND_KEY] = sender and sender.send
+                context.meta[outputs.RESULTS_KEY] = results
+                cli.invoke(context)
+    except click.UsageError as error:
+        raise SettingsError(error.format_message()) from error
+    if not results:
+        return text.getvalue(), None
+    data = json.loads(results[0])
+    return text.getvalue(), data["card"] if words[0] == "compare" else data
+
+
+def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
+    """Return the tools of the server, and for each the function that parses its arguments.
+
+    The input schemas are made from the options of the commands, the output schemas from the types
+    of the results.
+    """
+    from mcp.types import Tool
+
+    from px4fuse.card.model import Card
+    from px4fuse.results import contract
+
+    # command and type of the results by name of the tool
+    kinds: dict[str, tuple[str, type | UnionType | None]] = {
+        "info": ("info", dict),
+        "diagnose": ("compare", Card),
+        "what_if": ("whatif", contract.WhatIfResults),
+        "estimate_noise": ("tune", contract.TuningResults),
+        "estimate_time_offset": ("sync", contract.SyncResults),
+        "evaluate": ("evaluate", contract.EvaluationResults),
+        "close_loop": ("loop", contract.LoopResults | contract.GraphResults),
+        "explain": ("explain", None),
+        "list_findings": ("explain", None),
+    }
+    tools = list[tuple[Any, Any]]()
+    for name, (command_name, kind) in kinds.items():
+        command = cli.get_command(click.Context(cli), command_name)
+        parameters = {
+            ARGUMENT_NAMES.get(parameter.name or "", parameter.name or ""): parameter
+            for parameter in (command.params if command and name != "list_findings" else ())
+            if parameter.expose_value and parameter.name not in HIDDEN
+        }
+        input_schema = {
+            "type": "object",
+            "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
+            "required": [
+                name
+                for name, parameter in parameters.items()
+                if isinstance(parameter, click.Argument)
+            ],
+            "additionalProperties": False,
+        }
+        output_schema = None
+        if kind is not None:
+            schemas, definitions = contract.schema_of_types(get_args(kind) or (kind,))
+            output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
+        tool = Tool(
+            name=name,
+            description=COMMANDS[command_name] if parameters else "List the ids of all findings.",
+            input_schema=input_schema,
+            output_schema=output_schema,
+        )
+        tools.append((tool, partial(_parse, command_name, parameters, folders)))
+    return tools
+
+
+def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
+    kind, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
+    if isinstance(kind, click.Choice):
+        schema = {"enum": [*kind.choices]}
+    elif isinstance(kind, options.TypedQuantity):
+        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + kind.auto]}
+    elif isinstance(kind, click.IntRange):
+        schema = {"type": "integer"}
+    elif getattr(parameter, "is_flag", False):
+        schema = {"type": "boolean"}
+    elif parameter.metavar == "NAME=VALUE":
+        return {"type": "object", "additionalProperties": {"type": "number"}}
+    if parameter.multiple:
+        schema = {"type": "array", "items": schema}
+    return schema | {"description": getattr(parameter, "help", None) or ""}
+
+
+def _parse(
+    command_name: str,
+    parameters: Mapping[str, click.Parameter],
+    folders: Sequence[Path],
+    arguments: Mapping[str, Any],
+) -> tuple[list[str], list[Path]]:
+    """Return the command line of a tool call, and its input files.
+
+    Raises
+    ------
+    LogError
+        A file is outside the folders.
+    """
+    words, operands, files = [command_name], ["--"], list[Path]()
+    for name, parameter in parameters.items():
+        if name not in arguments:
+            continue
+        value, option = arguments[name], parameter.opts[-1]
+        if isinstance(value, dict):
+            value = [f"{key}={number}" for key, number in value.items()]
+        texts = [str(text) for text in (value if isinstance(value, list) else [value])]
+        if isinstance(parameter.type, options.InputPath):
+            texts = [_find_file(texts[0], folders)]
+            files.append(split_part(texts[0])[0])
+        if isinstance(parameter, click.Argument):
+            operands += texts
+        elif isinstance(value, bool):
+            words += [option] * value
+        else:
+            words += [f"{option}={text}" for text in texts]
+    return words + operands, files
+
+
+def _find_file(text: str, folders: Sequence[Path]) -> str:
+    """Return the absolute path of ``FILE`` or ``FILE:PART`` in the first folder that contains it.
+
+    Raises
+    ------
+    LogError
+        The file is outside the folders.
+    """
+    paths = [str(folder / text) for folder in folders]
+    path = next((path for path in paths if split_part(path)[0].exists()), paths[0])
+    check_readable(split_part(path)[0], folders)
+    return path

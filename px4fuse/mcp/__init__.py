@@ -1,0 +1,1 @@
+"""Model Context Protocol server (``px4fuse mcp``), with which assistants call px4fuse."""
