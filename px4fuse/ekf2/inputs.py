@@ -541,7 +541,8 @@ def _logged_decisions(
     due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
     log = ekf2.aids[aid.name].samples
     # EKF2 rejected all samples from the last fusion or reset to each row, and in dead reckoning
-    to_rows = np.array([log.get("last_fused_s", log.index), log.index]).T
+    fusions = log.reindex(columns=["last_fused_s"]).dropna()
+    to_rows = np.column_stack([fusions, fusions.index])
     in_reckoning = _dead_reckoning_spans(ekf2, record) if aid == EV_POS else to_rows[:0]
     limits = np.searchsorted(due_s, np.concatenate([to_rows, in_reckoning]) + STEP_TOLERANCE_S)
     for begin, end in limits.tolist():
