@@ -555,9 +555,10 @@ def _logged_decisions(
     may_reset[sample_row >= 0] &= (logged["rejected"] > 0.0) | (logged["innovation_m"] == 0.0)
     last_fused, ends = limits[: len(to_rows), 0] - 1, limits[len(to_rows) :, 1] - 1
     # a reset is visible in the next published state, one fusion horizon later than the measurement
+    published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
-        age_s = reset_s - due_s - horizon_s
-        rows = np.flatnonzero((age_s >= 0.0) & (age_s < MAX_RESET_PUBLICATION_S) & may_reset)
+        is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
+        rows = np.flatnonzero(is_recent & may_reset)
         ends_here = np.intersect1d(rows, ends)
         reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
     is_fused = np.zeros(len(reset), bool)
