@@ -581,8 +581,9 @@ def _sequential_update(
         column = columns[:, j : j + 1]
         cross_covariance = columns[:, j, rows]
         b[:, j] -= weight_squared[:, j] * cross_covariance[:, j]
-        factor = b[:, j, None] * cross_covariance[:, j + 1 :]
-        columns[:, j + 1 :] -= factor[:, :, None] * column
+        if j + 1 < nu.shape[1]:
+            factor = b[:, j, None] * cross_covariance[:, j + 1 :]
+            columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root

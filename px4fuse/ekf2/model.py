@@ -141,7 +141,7 @@ def _open_without_aids(
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
     segments = tuple(with_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
-    configurations = [flown_configuration, replace(flown_configuration, uses_logged_decisions=True)]
+    configurations = [flown_configuration]
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
@@ -150,13 +150,12 @@ def _open_without_aids(
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
+    model = Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if rejected_share > MANY_REJECTIONS_FRACTION and np.isfinite(inputs.received.rejected).any():
-        agreement_with_decisions = agreement_with_log(
-            flight, _make_replay(inputs, runs, configurations[1], {})
-        )
-        if isinstance(agreement_with_decisions, Agreement):
-            agreement = with_logged_rejections(agreement, agreement_with_decisions)
+        with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
+        if isinstance(with_decisions, Agreement):
+            agreement = with_logged_rejections(agreement, with_decisions)
     # the agreement of an omitted aiding source is from the replay that contained this source
     failed_fields = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
@@ -165,8 +164,7 @@ def _open_without_aids(
     agreement = structs.replace(
         agreement, doubtful={**doubtful_aids, **agreement.doubtful}, **failed_fields
     )
-    replay = structs.replace(replay, agreement=agreement)
-    return Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
+    return replace(model, flown=structs.replace(replay, agreement=agreement), agreement=agreement)
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
