@@ -5,9 +5,11 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
+from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight.ekf2_parameters import MAG
@@ -90,7 +92,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
-        action = f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
+        _, action = _gnss_heading_fault(analysis)
     elif analysis.source.name == IN_EKF2_FRAME:
         reason = "EKF2 fused them in this frame; the IMU measures the motion in another direction."
         action = "Align the positioning frame with north."
@@ -113,6 +115,15 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
+
+
+def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
+    """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
+    if (trial := confirmed_noise_trial(analysis)) is not None:
+        cause = f"the wrong {aid_of(analysis).noise}, which weights GNSS against the magnetometer"
+        return cause, f"Set {format_settings(trial.change)}, then check the heading again."
+    cause = "a magnetometer near currents or steel"
+    return cause, f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
 
 
 def _calibrate(analysis: Analysis) -> str:
@@ -158,13 +169,14 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     if heading.by == "orientation":
         basis = f"the orientation of {source_name(analysis.source)}"
     possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+    action = _calibrate(analysis)
     if analysis.source.origin.is_gnss:
-        possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
-    elif analysis.source.orientation is None:
-        action = ""  # the source has no yaw that EKF2 could fuse
-    elif not analysis.flight.log.has_ulog:
-        action = "Or let the autopilot fuse the yaw of the source."
+        possible_cause, action = _gnss_heading_fault(analysis)
+    elif analysis.source.orientation is not None:
+        actor, parameter = "EKF2", " (EKF2_EV_CTRL bit 3)"
+        if not analysis.flight.log.has_ulog:
+            actor, parameter = "the autopilot", ""
+        action += f" Or let {actor} fuse the yaw of the source{parameter}."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
@@ -174,7 +186,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
         f"{possible_cause}.",
-        f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
+        action.strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,
