@@ -29,8 +29,8 @@ from findings_tools import (
     positions,
     severity,
     source,
-    tried,
     statement,
+    tried,
     tuned,
     with_bias,
 )
