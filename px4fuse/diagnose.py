@@ -221,11 +221,11 @@ def intervene(
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
-    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
     trials = run_interventions(comparison, estimates, model)
     if isinstance(model, Model):  # frees memory; later replays are computed again
         model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
+    return Reruns(ekf2_model=model, difference_steps=difference_steps, trials=trials)
 
 
 def diagnose_or_check_aids(

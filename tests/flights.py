@@ -258,7 +258,7 @@ def _ekf2(
             for axis in AXIS_NAMES
         },
         innovation_topics=("estimator_aid_src_ev_pos",) if made.innovations_logged else (),
-        fusing=unavailable("EKF2 fusion flags")
+        fusion_flags=unavailable("EKF2 fusion flags")
         if made.fusing is None
         else table(
             np.array([at for at, _ in made.fusing]),

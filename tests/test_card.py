@@ -146,7 +146,10 @@ def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
     (ranked,) = rank_causes(analysis(), [OFFSET])
     for evaluated, reason in (
         (ratios, "no change: the reported σ is consistent"),
-        (untested, "no change: without ground truth no re-run shows the effect of this fault"),
+        (
+            untested,
+            "no change: the log has no ground truth, which would show this fault",
+        ),
     ):
         cause = make_cause(analysis(), ranked, evaluated, REQUEST)
         assert cause.actions[-1] == Action("KF, EKF2", reason)
@@ -186,5 +189,5 @@ def test_card_explains_why_the_two_verdicts_on_ekf2_differ() -> None:
     )
     assert card.reconcile == (
         "The verdicts of EKF2 against source and ground truth differ: innovations hardly show this "
-        "fault. The re-run with the first fix removes most of the position error."
+        "fault. The re-run with the first action removes most of the position error."
     )

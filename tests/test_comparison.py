@@ -283,7 +283,7 @@ class TestRobustness:
             ekf2 = flight.ekf2
             return [
                 flight.imu, flight.attitude, flight.positions[0].samples, flight.truth.samples,
-                ekf2.state, ekf2.variance, ekf2.fusing, *ekf2.innovations.values(),
+                ekf2.state, ekf2.variance, ekf2.fusion_flags, *ekf2.innovations.values(),
             ]  # fmt: skip
 
         before = [frame.copy() for frame in frames()]

@@ -294,7 +294,7 @@ def test_enu_orientation_finding_of_ned_source_names_conversion():
 def fused(flight: Flight) -> Flight:
     """Return a flight in which EKF2 fused the position and the yaw of the source."""
     fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [1.0]}, index=[0.0])
-    return replace(flight, ekf2=replace(flight.ekf2, fusing=fusing))
+    return replace(flight, ekf2=replace(flight.ekf2, fusion_flags=fusing))
 
 
 @pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [

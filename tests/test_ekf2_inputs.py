@@ -134,7 +134,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame({"rejected": []})},
-            horizon_s=horizon_s, step_s=0.01, fusing=fusing, aids={}, states={},
+            horizon_s=horizon_s, step_s=0.01, fusion_flags=fusing, aids={}, states={},
         )  # fmt: skip
         imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
         return prepare_inputs(
@@ -212,7 +212,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         ages = pd.Series([0.05, 0.15], index=[time[0], time[-1]])
         record = made(FusionRecord, parameters=parameters, vision_age_s=ages, states={})
         ekf2 = made(
-            Ekf2, fusing=pd.DataFrame({"yaw": [0.0, yaw]}), innovations={"north": NONE},
+            Ekf2, fusion_flags=pd.DataFrame({"yaw": [0.0, yaw]}), innovations={"north": NONE},
             record=record, horizon_s=0.1, innovation_topics=AID,
         )  # fmt: skip
         found = read_vision(made(Flight, positions=(own,)), ekf2, record, facing(90.0))

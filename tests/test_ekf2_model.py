@@ -185,7 +185,9 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Model, sample_flight: 
     ekf2 = sample_flight.ekf2
     samples = vision_of(sample_flight).copy()
     samples["down_m"] += 0.7
-    fused = replace(sample_flight, ekf2=replace(ekf2, fusing=ekf2.fusing.assign(vertical=1.0)))
+    fused = replace(
+        sample_flight, ekf2=replace(ekf2, fusion_flags=ekf2.fusion_flags.assign(vertical=1.0))
+    )
     low = opened(with_vision(fused, samples)).flown.delayed["down_m"].loc[40.0:100.0]
     own = model.flown.delayed["down_m"].loc[40.0:100.0]
     vision = samples["down_m"].loc[40.0:100.0]

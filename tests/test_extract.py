@@ -68,7 +68,7 @@ def test_extracted_csv_read_again_gives_identical_floats(written, sample_flight)
     expected = {
         "imu": sample_flight.imu, "attitude": sample_flight.attitude,
         "acceleration_ned": ned_acceleration(sample_flight), "ekf2_state": ekf2.state,
-        "ekf2_variance": ekf2.variance, "ekf2_fusing": ekf2.fusing,
+        "ekf2_variance": ekf2.variance, "ekf2_fusing": ekf2.fusion_flags,
         "truth": sample_flight.truth.samples,
     } | {f"position_{track.name}": track.samples for track in sample_flight.positions}  # fmt: skip
     for name, frame in expected.items():

@@ -78,7 +78,7 @@ from px4fuse.flight.position_source import (
 def with_fusion(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
     """EKF2 fields with a fusion flag that changes at these times."""
     time, value = zip(*pairs, strict=True)
-    return {"fusing": pd.DataFrame({column: value}, index=list(time), dtype=float)}
+    return {"fusion_flags": pd.DataFrame({column: value}, index=list(time), dtype=float)}
 
 
 def make_finding(name: str, level: Any = "error", caused_by: str | None = None) -> Finding:
@@ -268,7 +268,7 @@ def test_ekf2_rejection_severity_depends_on_rejected_fraction(
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
     for one, quantity, remedy in (
-        (level, "of the positions. Their innovations are beyond its gate of 5 √S", CHECK_FIRST),
+        (level, "of the positions. Their innovations are outside its gate of 5 √S", CHECK_FIRST),
         (down, "of the heights", CHECK_FIRST),
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
@@ -472,7 +472,7 @@ def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
     for has_ulog in (True, False):
-        one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
+        one = analysis(source=frd, ekf2={"fusion_flags": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
         assert ("Give the ULog" in finding.remedy) is has_ulog
@@ -526,7 +526,7 @@ def test_heading_error_with_wrong_gnss_noise_names_this_noise(degrees, noise_is_
 
 def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
-    assert "It is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
+    assert "Its error is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
     finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
     assert "rotated by -20°" in finding.title
 
@@ -914,7 +914,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         finding = only(source_positions.detect_outliers, analysis(axes=axes, tuning=outliers))
         assert finding.evidence["max_m"] == pytest.approx(np.hypot(north_m, 4.0))
         assert finding.title.startswith("3 of 120 UWB positions are outliers of up to ")
-        assert f"distance of {north_m:.2f} m to {reference}" in finding.message
+        assert f"distance to {reference} is {north_m:.2f} m" in finding.message
 
 
 def test_position_outlier_finding_states_number_ekf2_rejected() -> None:

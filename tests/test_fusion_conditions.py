@@ -110,7 +110,7 @@ def test_first_unmet_fusion_condition_states_value_and_action(
 
 def unfused(**parts: Any) -> Any:
     """Make a flight of v1.14 in which EKF2 never fuses external vision."""
-    ekf2 = {"fusing": pd.DataFrame({"horizontal": on(0.0)}), "horizon_s": 0.2}
+    ekf2 = {"fusion_flags": pd.DataFrame({"horizontal": on(0.0)}), "horizon_s": 0.2}
     ekf2 |= parts.pop("ekf2", {})
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
@@ -137,7 +137,7 @@ def test_position_that_ekf2_declares_invalid_is_reported(
 ) -> None:
     valid = pd.Series([1.0, 0.0], index=[0.0, valid_until_s])
     state = positions(np.arange(0.0, 120.0), 2e6)
-    one = unfused(ekf2={"states": {"xy_valid": valid}, "state": state, "fusing": NONE},
+    one = unfused(ekf2={"states": {"xy_valid": valid}, "state": state, "fusion_flags": NONE},
                   flight={"truth": NONE})  # fmt: skip
     assert named(ekf2_not_fusing.detect, one) == (
         {"ekf2_position_invalid": expected} if expected else {}

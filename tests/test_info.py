@@ -68,7 +68,7 @@ def test_info_rows_match_contents_of_flight(sample_flight):
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
         "EKF2 variance": ekf2.variance, "innovations": ekf2.innovations["north"],
-        "fusion flags": ekf2.fusing, "ground truth": sample_flight.truth.samples,
+        "fusion flags": ekf2.fusion_flags, "ground truth": sample_flight.truth.samples,
     }  # fmt: skip
     for part, frame in frames.items():
         row = source(inventory, part)

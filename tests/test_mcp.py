@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.log import WITHHELD
-from px4fuse.mcp.server import MAX_CACHED, NOTICE, TEXTS, Server
+from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED, NOTICE, PROMPTS, Server
 from px4fuse.results.contract import schema, to_json
 
 # Command of px4fuse for each tool that analyses a file
@@ -72,7 +73,8 @@ def started(*options: str | Path, folder: Path = SAMPLES) -> StdioServerParamete
     return StdioServerParameters(
         command=sys.executable,
         args=["-m", "px4fuse", "mcp", "--root", str(folder), *map(str, options)],
-        env={"PYTHONPATH": str(REPOSITORY)},
+        # with the variables of OpenBLAS, which affect the last digits
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )
 
 
@@ -151,8 +153,8 @@ def test_prompt_contains_the_log_in_its_own_message(tmp_path: Path) -> None:
             assert [argument.name for argument in prompt.arguments or []] == ["log"]
             messages = (await client.get_prompt(prompt.name, {"log": hostile})).messages
             texts = [message.content.text for message in messages]
-            assert texts == [TEXTS.prompts[prompt.name].text, hostile]
-        assert client.instructions == TEXTS.instructions
+            assert texts == [PROMPTS[prompt.name]["text"], hostile]
+        assert client.instructions == INSTRUCTIONS
 
     connect(in_process(tmp_path), talk)
 
@@ -260,6 +262,20 @@ def test_each_tool_returns_the_results_of_its_command() -> None:
         for file in ("aisle_uwb.tlog", "loop_vio.ulg"):
             answer = await client.call_tool("diagnose", {"log": file})
             assert answer.structured_content == printed("compare", SAMPLES / file)["card"]
+
+    connect(started(), talk)
+
+
+@pytest.mark.process
+def test_documented_session_contains_the_real_answers() -> None:
+    page = (REPOSITORY / "docs" / "assistants.md").read_text(encoding="utf-8")
+    calls = re.findall(r"^`(\w+)` with `(.*)`:\n\n```text\n(.*?)\n```$", page, re.M | re.S)
+    assert [name for name, _, _ in calls] == ["diagnose", "what_if"]
+
+    async def talk(client: Client) -> None:
+        for name, arguments, documented in calls:
+            answer = text_of(await client.call_tool(name, json.loads(arguments)))
+            assert [line.rstrip() for line in answer.strip().splitlines()] == documented.split("\n")
 
     connect(started(), talk)
 

@@ -84,7 +84,7 @@ def test_severity_of_wrong_noise_setting_depends_on_its_factor(
     if off is None or expected is None:
         assert off is expected
         return
-    assert (off.severity, off.size) == (expected[0], pytest.approx(expected[1], rel=0.01))
+    assert (off.severity, off.factor) == (expected[0], pytest.approx(expected[1], rel=0.01))
 
 
 SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m": 0.5}
@@ -148,8 +148,8 @@ def test_wrong_noise_finding_states_factor_and_estimated_noise() -> None:
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
-        "too small: KF lags the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate is "
-        "9 m/s². P" in worse.message
+        "too small: KF lags behind the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate "
+        "is 9 m/s². P" in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -220,7 +220,7 @@ def test_near_zero_process_noise_finding_states_response_time() -> None:
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A (--sigma-a)."
     assert finding.title == "SIGMA_A 1 m/s² makes Q almost zero: KF ignores new positions"
-    assert "so the gain falls to 0.05. KF needs 5 s" in finding.message
+    assert "The gain falls to 0.05. KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
     one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)),
                    trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
@@ -496,7 +496,7 @@ def test_possible_source_drift_finding_states_closure_error() -> None:
     ):  # fmt: skip
         one = analysis(source=ODOMETRY, tuning=tuned(noise), loop=closing(1.25))
         finding = only(hidden_errors.detect, one)
-        assert f"noise between successive positions is {bound}{value} m" in finding.message
+        assert f"position noise without drift is {bound}{value} m" in finding.message
         assert finding.evidence["short_term_noise_m"] == value
         assert "closure error is 1.25 m after a path of 50 m." in finding.message
     assert named(hidden_errors.detect, analysis(source=MOVING)) == {}

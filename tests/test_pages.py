@@ -420,22 +420,22 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # resources
     "an image": (
         draw_on_page(b"q 300 0 0 90 50 690 cm /X Do Q", resource("/XObject", "/X", image())),
-        "a picture or form", True,
+        "an image or form object", True,
     ),
     "an image with alternates": (
         resource("/XObject", "/X", image(Alternates=array(dictionary(DefaultForPrinting=ON)))),
-        "a picture or form", True,
+        "an image or form object", True,
     ),
     "an image with a proxy": (
-        resource("/XObject", "/X", image(OPI=dictionary())), "a picture or form", True,
+        resource("/XObject", "/X", image(OPI=dictionary())), "an image or form object", True,
     ),
     "an image with a mask": (
-        resource("/XObject", "/X", image(SMask=image())), "a picture or form", True,
+        resource("/XObject", "/X", image(SMask=image())), "an image or form object", True,
     ),
     "a form XObject": (
         draw_on_page(b"/X Do", resource("/XObject", "/X", stream(WHITE, Subtype=name("Form"),
                                                           BBox=box(0, 0, 600, 850)))),
-        "a picture or form", True,
+        "an image or form object", True,
     ),
     "a soft mask": (
         draw_on_page(b"/g9 gs", resource("/ExtGState", "/g9", dictionary(SMask=name("None")))),
@@ -462,7 +462,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a page in a group": (page(1, "/Group", dictionary(S=name("Transparency"))),
                           "an entry /Group", True),
     "a thumbnail": (page(1, "/Thumb", image()), "an entry /Thumb", True),
-    "an action of a page": (page(1, "/AA", dictionary()), "automatic action", True),
+    "an action of a page": (page(1, "/AA", dictionary()), "action that runs automatically", True),
     "a page shown for a second": (page(1, "/Dur", N(1)), "an entry /Dur", True),
     "another parent": (rotated_parent, "a rotation", True),
     "an inherited rotation": (
@@ -474,8 +474,10 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a page more": (kids(lambda k: [*k, k[0]]), "px4fuse draws only 2 pages", False),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
-    "an opening action": (catalogue("/OpenAction", array()), "automatic action", True),
-    "actions": (catalogue("/AA", dictionary()), "automatic action", True),
+    "an opening action": (
+        catalogue("/OpenAction", array()), "action that runs automatically", True,
+    ),
+    "actions": (catalogue("/AA", dictionary()), "action that runs automatically", True),
     "a mode of display": (catalogue("/PageMode", name("FullScreen")), "an entry /PageMode", True),
     "a layout": (catalogue("/PageLayout", name("TwoPageLeft")), "an entry /PageLayout", True),
     "page labels": (

@@ -26,7 +26,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.explore import practice
-from px4fuse.explore.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw
+from px4fuse.explore.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw_flights
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
 from px4fuse.simulation.flights import simulate_flight
@@ -44,8 +44,8 @@ SEED, COUNT = 5, 3
 def test_practice_flights_contain_each_fault_equally_often(
     seed: int, level: int, count: int
 ) -> None:
-    rounds = draw(seed, level, count)
-    assert draw(seed, level, count) == rounds
+    rounds = draw_flights(seed, level, count)
+    assert draw_flights(seed, level, count) == rounds
     assert len(rounds) == count
     first = Counter(one.mistakes[0].choice if one.mistakes else "nothing" for one in rounds)
     assert max(first.values()) - min(first[name] for name in FAULT_CHOICES) <= 1
@@ -59,7 +59,7 @@ def test_practice_flights_contain_each_fault_equally_often(
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:
-    rounds = [one for seed in range(5) for one in draw(seed, 3, 12)]
+    rounds = [one for seed in range(5) for one in draw_flights(seed, 3, 12)]
     two = sum(len(one.mistakes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
@@ -198,7 +198,7 @@ def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
     assert [one["right"] for one in answers] == [
-        one.correct_answers for one in draw(SEED, 1, COUNT)
+        one.correct_answers for one in draw_flights(SEED, 1, COUNT)
     ]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
         flight = json.loads(content)["flight"]

@@ -149,8 +149,8 @@ def test_read_ulog_of_each_px4_release_reads_state_and_imu(read, generation):
     np.testing.assert_allclose(flight.imu["down_m_s2"], -GRAVITY, rtol=1e-6)
     assert (flight.attitude == [1.0, 0.0, 0.0, 0.0]).all(axis=None)
     assert flight.airborne == ((1.0, 9.0),)
-    assert (flight.ekf2.fusing[["horizontal", "vertical"]] == 1).all(axis=None)
-    assert (flight.ekf2.fusing["yaw"] == 0).all()
+    assert (flight.ekf2.fusion_flags[["horizontal", "vertical"]] == 1).all(axis=None)
+    assert (flight.ekf2.fusion_flags["yaw"] == 0).all()
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)

@@ -138,13 +138,13 @@ def test_simulated_ekf2_at_rest_estimates_level_attitude():
 
 def test_simulated_ekf2_stops_fusing_a_slow_source():
     slow = flown("decimate=2Hz")
-    fusing = slow.ekf2.fusing
+    fusing = slow.ekf2.fusion_flags
     assert not fusing["horizontal"].any()
     assert "ekf2_not_fusing" in named(slow)
     # EKF2 holds its position instead of drifting on the IMU
     assert slow.ekf2.state[["north_m", "east_m"]].abs().max().max() < 5.0
     gap = flown("dropout=8s,30s")
-    fusing = gap.ekf2.fusing
+    fusing = gap.ekf2.fusion_flags
     off = fusing[fusing["horizontal"] == 0.0].loc[28.0:39.0]
     assert off.index[0] == pytest.approx(30.4, abs=0.3)
     resets = [reset for reset in gap.ekf2.resets if reset.time_s > 10.0]
@@ -202,8 +202,8 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
 def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
-    assert flight.ekf2.fusing["horizontal"].max() == 0.0
-    assert clean.ekf2.fusing["horizontal"].max() == 1.0
+    assert flight.ekf2.fusion_flags["horizontal"].max() == 0.0
+    assert clean.ekf2.fusion_flags["horizontal"].max() == 1.0
     # as in PX4, samples are compared with the state but not fused
     record, plain = flight.ekf2.record, clean.ekf2.record
     assert len(record.vision_age_s) == len(plain.vision_age_s)

@@ -469,11 +469,11 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     ),
     "another title": (document_info(Title="my report"), "page differs", "document: the PDF entry"),
     "a form": (
-        catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that",
+        catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields, which",
     ),
     "an annotation": (
         lambda w: w.add_annotation(1, Link(rect=(50, 50, 200, 70), url="http://example.org")),
-        "cannot verify", "page 2: the PDF contains an annotation that px4fuse does not write",
+        "cannot verify", "page 2: the PDF contains an annotation, which px4fuse does not write",
     ),
     "a part that nothing refers to": (lambda w: w._add_object(dictionary()), "verified", ""),
 }  # fmt: skip

@@ -26,8 +26,8 @@ def explain_mismatch(
     positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
     table = pd.DataFrame(positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION)
     track = PositionTrack("", POSITION_FILE, "", table, "unknown", "", ())
-    reach = {} if problem.lag_s is not None else {"max_offset_s": span_s}
-    convention = check_convention(flight, track, **reach)
+    search_limits = {} if problem.lag_s is not None else {"max_offset_s": span_s}
+    convention = check_convention(flight, track, **search_limits)
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
@@ -40,5 +40,5 @@ def explain_mismatch(
         faults.append(describe_axes(axes, stated, is_mirrored=convention.is_mirrored, is_file=True))
     if not faults:
         return None
-    texts, actions = zip(*faults, strict=True)
-    return "; ".join(texts), " ".join(actions)
+    fault_texts, actions = zip(*faults, strict=True)
+    return "; ".join(fault_texts), " ".join(actions)

@@ -116,12 +116,12 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     }
     missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
     reasons = []
-    makers = [tracks.make_ekf2_references]
+    reference_functions = [tracks.make_ekf2_references]
     # Parameters that the user gave are only checked against EKF2, because the band-pass filtered
     # motion of the IMU is not accurate enough for a check
     if missing_options:
-        makers.append(tracks.make_imu_references)
-    for make_references in makers:
+        reference_functions.append(tracks.make_imu_references)
+    for make_references in reference_functions:
         try:
             match = _match(make_references(flight), problem)
             _check_match(match)
@@ -153,15 +153,15 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     for reference in references:
         name = reference.name
         fit_frame = partial(_best_fit, problem, reference)
-        fits = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
-        fits.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
-        best_frame, fit = fits[0]
+        fit_by_frame = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
+        fit_by_frame.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
+        best_frame, fit = fit_by_frame[0]
         free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
         is_rotated = is_good_fit(free_yaw_fit, name) and (
             fit.concordance < MIN_CONCORDANCE[name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
         )
-        residuals_m = {frame: fit.rms_m for frame, fit in fits}
+        residuals_m = {frame: fit.rms_m for frame, fit in fit_by_frame}
         matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
     return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 

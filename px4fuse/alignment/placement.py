@@ -150,11 +150,13 @@ def align_position_file(
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
     """Return the clock of a file in which most rows repeat a timestamp, else None."""
-    distinct = len(recording.samples)
-    count = distinct + recording.dropped
-    if distinct > MAX_DISTINCT_FRACTION * count:
+    distinct_count = len(recording.samples)
+    row_count = distinct_count + recording.dropped
+    if distinct_count > MAX_DISTINCT_FRACTION * row_count:
         return None
-    return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
+    return ClockMap(
+        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct_count
+    )
 
 
 def _check_options(

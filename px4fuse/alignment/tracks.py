@@ -112,9 +112,9 @@ def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
 
 def band_pass(position_m: Array) -> Array:
     """Band-pass filter positions on the time grid, without delay."""
-    sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
+    filter_sections = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     return sosfiltfilt(
-        sos,
+        filter_sections,
         position_m,
         axis=0,
         padlen=min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1),
@@ -138,8 +138,8 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
         raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
     position_m = finite_state[Columns.POSITION].to_numpy()
     grid = resample_to_grid(_track_without_gaps(finite_state.index.to_numpy(), position_m))
-    smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
-    return replace(grid, position_m=smooth, name=EKF2_POSITION)
+    smooth_m = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
+    return replace(grid, position_m=smooth_m, name=EKF2_POSITION)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:

@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
-from px4fuse.html.safe import clean, load_template, local_link
+from px4fuse.html.safe import clean_text, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
@@ -87,7 +87,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}. Compared by {made_with}.",
         html_above=load_template("batch/axis.html").render(limits=band_limits()),
-        noun=("log", "logs"),
+        row_nouns=("log", "logs"),
         columns=(
             Column("Sign", "rank"),
             Column("Log", "name"),
@@ -218,7 +218,7 @@ def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]
     page_filters = []
     for kind, label in PAGE_FILTERS.items():
         options = [
-            (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
+            (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]

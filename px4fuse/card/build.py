@@ -36,7 +36,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
-from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
+from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
@@ -46,7 +46,7 @@ from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -57,6 +57,7 @@ from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
+KF_SETTINGS = {"sigma_a_m_s2": "SIGMA_A", "sigma_z_m": "SIGMA_Z", "dt_s": "DT"}
 # Minimum fraction of rejected positions that the card reports
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
@@ -75,13 +76,13 @@ HEADING_HIDES_ERROR = (
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
 )
-WITHHELD_HEADLINE = "Assignment: the diagnosis is the student's, and px4fuse withholds its own"
+WITHHELD_HEADLINE = "Assignment: the student makes the diagnosis, so px4fuse prints none"
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
 # Explanation of different verdicts against source and ground truth, by ids of findings
 SENTENCES_BY_SOURCE_FAULT = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
-        "KF uses the corrected positions. EKF2 used the positions as they were sent.",
+        "KF uses the corrected axes, unit and orientation of the source. EKF2 used them as sent.",
     ),
     (
         {
@@ -193,9 +194,11 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the diagnosis card of a log that cannot be analysed: fault and fix."""
     facts = {}
     with suppress(LogError):  # the headline states the reason if the file cannot be read
-        head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
-        size = file_size(path, LogError)
-        facts["read"] = f"{size:,} bytes; the file begins with {head}, a ULog with {ULOG_HEAD}"
+        first_bytes = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
+        size_bytes = file_size(path, LogError)
+        facts["read"] = (
+            f"{size_bytes:,} bytes; the file begins with {first_bytes}, a ULog with {ULOG_HEAD}"
+        )
     if error.remedy:
         facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
     return Card(
@@ -242,11 +245,7 @@ def _make_effect(analysis: Analysis) -> Effect:
         reset_count = int(((flight.start_s < resets_s) & (resets_s <= flight.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, result),
-        position_rmse_m={
-            filter_name: truth.position_rmse_m
-            for filter_name, statement in result.filters.items()
-            if isinstance(truth := statement.truth, ErrorsAgainstTruth)
-        },
+        position_rmse_m=_position_rmse_m(result),
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
@@ -265,34 +264,36 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 
-def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    errors_m = {
-        filter_name: [
-            truth.position_rmse_m
-            for axis in axes
-            if isinstance(truth := axis.filters[filter_name].truth, ErrorsAgainstTruth)
-        ]
-        for filter_name in FILTER_NAMES
-    }
+def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
     return {
-        filter_name: math.hypot(*pair) for filter_name, pair in errors_m.items() if len(pair) == 2
+        filter_name: truth.position_rmse_m
+        for filter_name, statement in result.filters.items()
+        if isinstance(truth := statement.truth, ErrorsAgainstTruth)
     }
+
+
+def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
+    errors_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
+    if len(errors_m) < 2:
+        return {}
+    north_m, east_m = errors_m
+    return {name: math.hypot(north_m[name], east_m[name]) for name in north_m if name in east_m}
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
     is_part = max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
-    when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
+    span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
+        horizontal = _lengths_by_filter(effect.horizontal_rmse_m)
+        horizontal = f" (horizontal: {horizontal})" if horizontal else ""
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "
-            f"{_lengths_by_filter(effect.position_rmse_m)}"
-            f"{_bracketed_lengths('horizontal', effect.horizontal_rmse_m)}."
+            f"Position RMSE against ground truth along {analysis.main.axis.label}{span_text}: "
+            f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal}."
         )
         for verdict in verdicts:
             if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
@@ -348,10 +349,6 @@ def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
         f"{FILTER_NAMES[filter_name]} {format_metres(length_m)} m"
         for filter_name, length_m in lengths_m.items()
     )
-
-
-def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str:
-    return f" ({label}: {_lengths_by_filter(lengths_m)})" if lengths_m else ""
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
@@ -460,8 +457,8 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
         filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
         return (
             f"The verdicts of {filters} against source and ground truth differ: innovations "
-            "hardly show this fault. The re-run with the first fix removes most of the position "
-            "error."
+            "hardly show this fault. The re-run with the first action removes most of the "
+            "position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -471,8 +468,8 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
         ):
             noise = f" of {format_metres(sigma)} m"
         return (
-            f"The position noise{noise} is less than KF and EKF2 assume. Innovations do not show "
-            "the drift of the source, ground truth does."
+            f"The position noise{noise} is smaller than KF and EKF2 assume. Only ground truth "
+            "shows the drift of the source."
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
@@ -495,9 +492,9 @@ def _gate_sentence(analysis: Analysis) -> str:
     )
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
-        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions: they did not "
-        "change EKF2's state, but its mean NIS contains them. Without them, the RMS of EKF2's "
-        f"innovation ÷ √S is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, which its mean "
+        "NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is "
+        f"{format_ratio(ratio)}."
     )
 
 
@@ -521,9 +518,8 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     difference_after_m = after.get(filter_name)
     if difference_after_m is None:
         return f"{text}."
-    predicted = "predicted " if filter_name == "ekf2" else ""
-    difference_text = f"{format_metres(difference_after_m)} m {predicted}with"
-    return f"{text}; {difference_text} {FILTER_NAMES[filter_name]} corrected."
+    suffix = "predicted with EKF2" if filter_name == "ekf2" else "with KF"
+    return f"{text}; {format_metres(difference_after_m)} m {suffix} corrected."
 
 
 def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
@@ -553,17 +549,13 @@ def _identity(
 def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
     texts = []
-    for name, label, unit in (
-        ("sigma_a_m_s2", "SIGMA_A", "m/s²"),
-        ("sigma_z_m", "SIGMA_Z", "m"),
-        ("dt_s", "DT", "s"),
-    ):
+    for name, label in KF_SETTINGS.items():
         value, origin = getattr(settings, name), "set by the user"
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):
             origin = "default"
-        texts.append(f"{label} {value:g} {unit} ({origin})")
+        texts.append(f"{label} {value:g} {SETTING_UNITS[name]} ({origin})")
     return ", ".join(texts)
 
 
@@ -571,7 +563,7 @@ def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
-        for name in ("sigma_a_m_s2", "sigma_z_m", "dt_s")
+        for name in KF_SETTINGS
         if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
     )
 

@@ -274,7 +274,7 @@ def _no_change_reason(
         return ""
     if set(words.values()) == {"consistent"}:
         if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_CHANGE_KINDS:
-            return "no change: without ground truth no re-run shows the effect of this fault"
+            return "no change: the log has no ground truth, which would show this fault"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
@@ -303,7 +303,7 @@ def run_again(
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
     )
-    sentence = f"run again without {options}, or with the estimate" if options else ""
+    sentence = f"run again without {options}, or with the estimated noises" if options else ""
     return Action("KF", sentence, (command,), "shell")
 
 
@@ -322,20 +322,20 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
     before, after = trial.before, trial.after
     ratios_before, ratios_after = ratios(before), ratios(after)
-    pairs: dict[str, Any] = {
+    before_after: dict[str, Any] = {
         "position_rmse_m": (before.position_rmse_m, after.position_rmse_m),
         "source_ratio": (ratios_before.get("source"), ratios_after.get("source")),
         "truth_ratio": (ratios_before.get("truth"), ratios_after.get("truth")),
     }
     rejected_fractions = before.rejected_fraction or 0.0, after.rejected_fraction or 0.0
     if max(rejected_fractions) >= MIN_SHOWN_REJECTION:
-        pairs["rejected_fraction"] = before.rejected_fraction, after.rejected_fraction
+        before_after["rejected_fraction"] = before.rejected_fraction, after.rejected_fraction
     return Rerun(
         label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=improvement(trial),
-        **{name: pair for name, pair in pairs.items() if None not in pair},
+        **{name: pair for name, pair in before_after.items() if None not in pair},
     )
 
 
@@ -363,11 +363,11 @@ def _closing_sentence(
     if alternatives:
         return (
             "Take only one of these actions: both correct the same time offset. Their signs "
-            "differ: --clock-offset (s, this log only) is added to the timestamps, the delay "
+            "differ: --clock-offset (s) is added to the timestamps of this log, the delay "
             "parameter (ms) is the age of a position."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return "KF is consistent with the default and with the estimate."
+        return "KF is consistent with the default noises, and with the estimated noises."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):

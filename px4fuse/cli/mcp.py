@@ -51,8 +51,8 @@ HIDDEN = {
 def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: float) -> None:
     """Serve px4fuse to assistants (Model Context Protocol).
 
-    An assistant program starts this command, and exchanges messages with it on standard input and
-    output. The tools run other commands of px4fuse, for example compare and whatif, one at a time.
+    A program with a language model starts this command, and exchanges messages with it on standard
+    input and output. The tools of the server run other commands of px4fuse, for example compare.
     """
     if find_spec("mcp") is None:
         raise SettingsError(

@@ -81,7 +81,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=fault)
-    fusing = flight.ekf2.fusing if isinstance(flight.ekf2, Ekf2) else None
+    fusing = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
     is_fused = isinstance(fusing, pd.DataFrame) and bool((fusing > 0).any(axis=None))
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")

@@ -229,8 +229,8 @@ def files_below(folder: Path) -> list[Path]:
         try:
             with os.scandir(folder_path) as entries:
                 for entry in entries:
-                    target = open_folders if entry.is_dir(follow_symlinks=False) else files
-                    target.append(Path(entry.path))
+                    paths = open_folders if entry.is_dir(follow_symlinks=False) else files
+                    paths.append(Path(entry.path))
         except OSError:
             files.append(folder_path)
     return sorted(files)

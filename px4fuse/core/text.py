@@ -27,8 +27,8 @@ def to_json_types(value: object) -> Any:
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
-        children = {str(name): to_json_types(child) for name, child in value.items()}
-        return {name: child for name, child in children.items() if child is not None}
+        json_by_name = {str(name): to_json_types(child) for name, child in value.items()}
+        return {name: child for name, child in json_by_name.items() if child is not None}
     if isinstance(value, list | tuple):
         return list(map(to_json_types, value))
     if value is msgspec.UNSET or (isinstance(value, float) and not math.isfinite(value)):

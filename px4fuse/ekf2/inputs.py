@@ -314,8 +314,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         predict_s=predict_s(record),
         # EKF2 clips vision heights while it reports a bad acceleration; the model does not
         vision_height=not is_gnss
-        and isinstance(ekf2.fusing, pd.DataFrame)
-        and bool(ekf2.fusing["vertical"].mean() > 0.5)
+        and isinstance(ekf2.fusion_flags, pd.DataFrame)
+        and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
         and not any(np.any(segment.is_acceleration_bad) for segment in segments),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
@@ -456,7 +456,9 @@ def read_vision(
     timestamp_s = samples.index.to_numpy()
     position = samples[Columns.POSITION].to_numpy(copy=True)
     variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    is_rotated_by_ekf2 = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
+    is_rotated_by_ekf2 = (
+        not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
+    )
     if fuses_by_mask(record.parameters):
         is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:

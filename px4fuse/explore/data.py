@@ -1,7 +1,4 @@
-"""Data of one flight for the explore page: KF inputs, EKF2, ground truth, events, σ ratios.
-
-Python projects and integrates the signals and evaluates EKF2. The page runs only KF.
-"""
+"""Data of one flight for the explore page, which runs KF in the browser."""
 
 from typing import Any
 
@@ -18,7 +15,7 @@ from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTr
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS, Consistency
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
     DT_RANGE_S,
@@ -41,15 +38,7 @@ OFFSET_HALF_RANGE_S = 0.6
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> Data:
-    """Return all data of one flight for JSON; the packer contains the arrays.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Analysis of one flight, with the request.
-    packer : Packer
-        Collects the arrays.
-    """
+    """Return the data of one flight, which become JSON; the arrays are added to the packer."""
     signals = replay_signals(analysis, packer)
     events, request = analysis.events, analysis.request
     assert request is not None
@@ -77,18 +66,18 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
 
 
 def replay_signals(comparison: Comparison, packer: Packer) -> Data:
-    """Return the KF inputs: measurements, integrals of the acceleration, segment, covariance."""
-    raw = raw_source(comparison)
+    """Return the inputs of KF."""
+    source = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _imu_data(comparison, packer),
-        "axes": [_axis_signals(comparison, line, raw, packer) for line in comparison.lines],
+        "axes": [_axis_signals(comparison, line, source, packer) for line in comparison.lines],
     }
 
 
 def ranges() -> Data:
-    """Return limits and lesson values of the KF settings, and the scale of the σ ratio plots."""
+    """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
     return {
         "sigma-a": list(SIGMA_A_RANGE_M_S2),
         "sigma-z": list(SIGMA_Z_RANGE_M),
@@ -184,7 +173,6 @@ def _axis_signals(
 
 
 def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data:
-    """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
         "called": result.axis.label,
@@ -192,7 +180,6 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
         "ratios": [verdict.ratio for verdict in verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
-        # horizontal axes share their likelihood map if it exists
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
         "ekf2": _ekf2_data(analysis, result.in_flight, packer),
         "truth": _truth_data(result.in_flight, packer),
@@ -200,9 +187,9 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
 
 
 def _nis_bands(count: int, packer: Packer) -> list[dict[str, int]]:
-    """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
+    """Return the 95 % band of the mean NIS for each possible number of innovations.
 
-    The time offset moves measurements into or out of the segment, so their number can change.
+    The number changes because the time offset moves measurements into or out of the segment.
     """
     counts = np.arange(1, 2 * count + 1)
     probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
@@ -213,7 +200,6 @@ def _nis_bands(count: int, packer: Packer) -> list[dict[str, int]]:
 
 
 def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data | str:
-    """Return EKF2's states, σ, innovations and statistics, or the reason why they are missing."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
@@ -222,7 +208,14 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
         "state": _pack_frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": [],
         "innovations": [],
-        "summary": _summary(consistency),
+        "summary": {"why": consistency.reason}
+        if isinstance(consistency, Unavailable)
+        else {
+            "why": "",
+            "count": consistency.count,
+            "outside": consistency.fraction_outside_two_sigma,
+            "lag1": consistency.lag1_autocorrelation,
+        },
         "r": None,
     }
     if isinstance(consistency.truth, ErrorsAgainstTruth):
@@ -254,18 +247,6 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
     return ekf2
 
 
-def _summary(consistency: Consistency | Unavailable) -> Data:
-    """Return the statistics of EKF2, or the reason why they are missing."""
-    if isinstance(consistency, Unavailable):
-        return {"why": consistency.reason}
-    return {
-        "why": "",
-        "count": consistency.count,
-        "outside": consistency.fraction_outside_two_sigma,
-        "lag1": consistency.lag1_autocorrelation,
-    }
-
-
 def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
@@ -278,13 +259,12 @@ def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
 
 
 def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[dict[str, int]]:
-    """Pack the times and some columns of a frame."""
     values = [packer.add(table[column].to_numpy(), COARSE_SCALE) for column in columns]
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
 def _map_data(analysis: Analysis) -> Data:
-    """Return the estimates of each likelihood map, or the reason why the map is missing."""
+    """Return the noise estimates of each likelihood map, or the reason why they are missing."""
     return {
         name: {
             "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
@@ -297,7 +277,7 @@ def _map_data(analysis: Analysis) -> Data:
 
 
 def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
-    """Return EKF2's logged parameters of the source, and a command that replays EKF2."""
+    """Return EKF2's parameters of the source, and a command that replays EKF2."""
     aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
     flown_settings = {
         name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
@@ -310,15 +290,15 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
     parameter = PARAMETERS[aid.noise]
     flown_m = logged_parameters.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
-    example = WhatIfRequest(log=request.log, system=request.system, changes=changes)
-    return {"flown": flown_settings, "command": command_line(example, for_shell=True)}
+    replay_request = WhatIfRequest(log=request.log, system=request.system, changes=changes)
+    return {"flown": flown_settings, "command": command_line(replay_request, for_shell=True)}
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> Data:
-    """Return the `compare` command without KF settings, and one that fixes segment and aisle too.
+    """Return the `compare` command, with automatic and with explicit segment and aisle.
 
-    The automatic segment and aisle depend on the timestamps. With another clock offset the command
-    must state them, so that the analysis uses the same ones.
+    Automatic segment and aisle depend on the clock offset, so a command with another offset states
+    them explicitly.
     """
     offset_s = None if request.position is None else request.clock_offset_s
     base_request = msgspec.structs.replace(

@@ -1,17 +1,11 @@
-"""Bokeh plots of the explore page without data, which the script of the page adds."""
+"""Bokeh plots of the explore page; JavaScript adds the data."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import (
-    ColumnDataSource,
-    FactorRange,
-    HoverTool,
-    LinearColorMapper,
-    Range1d,
-)
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, LinearColorMapper, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
@@ -23,10 +17,10 @@ from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 
 # Options of a drawing function of Bokeh
 Style = dict[str, Any]
-# Columns of all Bokeh data sources; the script of the page fills those that a plot needs
+# Columns of all Bokeh data sources, for example time, position, velocity and their σ; JavaScript
+# fills those that a plot needs
 COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
-# The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
-# the report
+# JavaScript sets the colours by `name`. KF is solid and round, EKF2 dashed and square
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: Style = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
 TRUTH_LINE: Style = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
@@ -45,11 +39,11 @@ GAP_BAND: Style = {
 }
 # Limit of innovation ÷ √S that contains 95 % of the values of a consistent filter
 NORMAL_LIMIT = 2.0
-# Upper end of the plot of innovation ÷ √S; the lower end has the opposite sign
+# Limit (±) of the axis of innovation ÷ √S
 NORMAL_END = 4.6
-# Width (pixels) left of the axis of a plot
+# Left margin (pixels) of a plot
 LEFT_BORDER = 50
-# Width (pixels) left of the axis of the event plot, which has longer labels, and of the plot above
+# Left margin (pixels) of the event plot, whose labels are longer, and of the plot above it
 EVENT_BORDER = 82
 STYLES = {
     "kf": KF_LINE,
@@ -57,17 +51,17 @@ STYLES = {
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Distance from the maximum, √(2 · (ln L_max − ln L)), of the palest colour of the likelihood map
+# Distance (σ) from the maximum of the likelihood at which the map has its palest colour
 MAP_SIGMAS = 6.0
 
 
 class Plot(Record, frozen=True):
-    """A plot against time.
+    """Plot over time.
 
     Attributes
     ----------
-    lines : tuple of (source, column, style, name)
-        ``style`` is a key of :data:`STYLES`, ``name`` the label in the tooltip ("": no tooltip).
+    lines : tuple of (str, str, str, str)
+        Data source, column, key of :data:`STYLES`, and label in the tooltip of each line.
     """
 
     lines: tuple[tuple[str, str, str, str], ...]
@@ -76,7 +70,7 @@ class Plot(Record, frozen=True):
 
 
 class View(Record, frozen=True):
-    """View of the page, with the titles of its plots by their names."""
+    """Tab of the page; ``plots`` are the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
@@ -95,15 +89,7 @@ FIGURES = table(__file__, "figures.toml", Figures)
 
 
 def document_json(data: Data, analysis: Analysis) -> tuple[Any, dict[str, str]]:
-    """Return Bokeh's document, and the id of the page element for each plot.
-
-    Parameters
-    ----------
-    data : dict
-        From :func:`px4fuse.explore.data.flight_data`.
-    analysis : Analysis
-        Contains the noise estimates and the data of the likelihood maps.
-    """
+    """Return Bokeh's document with all plots, and the name of each plot by its id."""
     document = Document()
     time_range = _page_range("time")
     plots = _make_plots(data, time_range)
@@ -160,7 +146,7 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             lines.append(line_renderer)
             if hover_name:
                 _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
-        if name == "error":  # the 2σ band is much wider at the initial state
+        if name == "error":  # the initial 2σ band is too wide for scaling the axis
             fig.y_range.renderers = lines
         _add_cursor(fig, name="cursor")
         for low, high in data["events"]["gap"]:
@@ -180,16 +166,15 @@ class _Sources(dict[str, ColumnDataSource]):
 
 
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
-    """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
     fig.y_range = Range1d(start=-NORMAL_END, end=NORMAL_END)
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
     kf_dots = _draw_dots(fig, sources["updates"], "t x", 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
     _draw_dots(fig, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
-        square: Style = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(fig, sources["fused"], "t x", 4, **square)
-        rejected_dots = _draw_dots(fig, sources["rejected"], "t x", 7, **square, **HOLLOW_MARKER)
+        style: Style = {"marker": "square", "name": "ekf2"}
+        fused_dots = _draw_dots(fig, sources["fused"], "t x", 4, **style)
+        rejected_dots = _draw_dots(fig, sources["rejected"], "t x", 7, **style, **HOLLOW_MARKER)
         _add_hover(fig, fused_dots, ("EKF2", "@x{0.00}"))
         _add_hover(fig, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
         _draw_dots(fig, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
@@ -197,7 +182,7 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    # Tooltips of KF, EKF2 and ground truth are on different sides, so they do not overlap
+    # on different sides, so that tooltips do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
@@ -214,17 +199,14 @@ def _add_cursor(fig: Any, **options: Any) -> None:
 
 
 def _page_range(name: str | None = None) -> Range1d:
-    """Return a plot range that the script of the page sets."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _empty_source(name: str) -> ColumnDataSource:
-    """Return an empty source with all columns of the page, which the script of the page fills."""
     return ColumnDataSource({column: [] for column in COLUMNS.split()}, name=f"{name}-source")
 
 
 def _event_plot(data: Data, time_range: Range1d) -> Any:
-    """Make the event plot, with a row per kind of event."""
     source = _empty_source("strip")
     rows = FIGURES.event_rows if _has_kind(data, "ekf2") else FIGURES.event_rows[2:]
     fig = _figure(
@@ -268,27 +250,25 @@ def _likelihood_map(analysis: Analysis) -> Any:
             grids = map_grids(axis_tuning)
             (x, dw), (y, dh) = map(_pixel_extent, grids)
             kf_axes = (result.axis for result in analysis.axes.values())
-            drop = log_likelihood_drop(axis_tuning, kf_axes, analysis.settings, *grids)
+            decrease = log_likelihood_drop(axis_tuning, kf_axes, analysis.settings, *grids)
             # rows: SIGMA_Z, columns: SIGMA_A
-            image = np.sqrt(2.0 * drop.T).astype(np.float32)
+            image = np.sqrt(2.0 * decrease.T).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    best_point = _empty_source("best")
-    point = _empty_source("point")
-    white: Style = {"line_color": "white"}
-    _draw_dots(fig, best_point, "x y", 13, marker="cross", line_width=2.5, **white)
-    _draw_dots(fig, point, "x y", 12, fill_color="darkorange", line_width=2.0, **white)
+    style: Style = {"line_color": "white"}
+    _draw_dots(fig, _empty_source("best"), "x y", 13, marker="cross", line_width=2.5, **style)
+    current = _empty_source("point")
+    _draw_dots(fig, current, "x y", 12, fill_color="darkorange", line_width=2.0, **style)
     return fig
 
 
 def _draw_dots(fig: Any, source: ColumnDataSource, columns: str, size: int, **style: Any) -> Any:
-    """Draw two columns of the source as dots without edge lines, for example "t z"."""
     x, y = columns.split()
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Return start and length of an image along a logarithmic axis; ``values``: pixel centres."""
+    """Return start and length of an image from its logarithmically spaced pixel centres."""
     half_pixel = float(np.sqrt(values[1] / values[0]))
     start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
     return start, end - start
@@ -307,11 +287,8 @@ def _phase_plot() -> Any:
     )
     fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
     _add_cursor(fig, name="measurement", line_dash=[2, 2])
-    trail = _empty_source("trail-means")
-    point_before, current_point = _empty_source("before"), _empty_source("now")
-    mean = _empty_source("mean")
-    fig.line("p", "v", source=trail, name="measured")
-    fig.line("p", "v", source=point_before, **KF_LINE | {"line_dash": [6, 3]})
-    fig.patch("p", "v", source=current_point, fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, mean, "p v", 7, name="kf")
+    fig.line("p", "v", source=_empty_source("trail-means"), name="measured")
+    fig.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
+    fig.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
+    _draw_dots(fig, _empty_source("mean"), "p v", 7, name="kf")
     return fig

@@ -1,7 +1,7 @@
-"""Compact encoding of arrays for the page, with a negligible rounding error.
+"""Compact encoding of arrays for the page.
 
-Values are rounded to integer multiples of a step. Their differences are divided into byte planes
-(the upper planes are nearly constant), compressed by deflate and encoded as base64.
+Numbers are rounded to integers; their differences are split into planes of lower and upper bytes,
+compressed by deflate and encoded as base64.
 """
 
 import base64
@@ -12,10 +12,10 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Steps per unit for values that KF uses: one step is 1.5e-11 m, m/s or s, which is 1 % of the
-# tolerance between KF in the page and KF in Python
+# Rounding steps per m, m/s or s for values that KF uses: 1 % of the tolerance between KF in
+# JavaScript and KF in Python
 FINE_SCALE = 2.0**36
-# Steps per unit for values that are only drawn or averaged
+# Rounding steps per m, m/s or s for values that are only drawn or averaged
 COARSE_SCALE = 1e6
 # Largest integer that JavaScript represents exactly, with a margin of a factor of two
 MAX_EXACT_INTEGER = 2.0**52
@@ -23,23 +23,13 @@ MAX_EXACT_INTEGER = 2.0**52
 
 @dataclass
 class Packer:
-    """Encoder of arrays; the data of the page contain ``{"array": index}`` for each array.
+    """Encoder of arrays; ``array_specs``: length, number of byte planes and scale of each array."""
 
-    ``specs`` contains length, number of byte planes and steps per unit of each array.
-    """
-
-    specs: list[tuple[int, int, float]] = field(default_factory=list)
+    array_specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
 
     def add(self, values: Array, scale: float = FINE_SCALE) -> dict[str, int]:
-        """Add one array of finite numbers and return its placeholder for the data of the page.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n,)
-        scale : float
-            Steps per unit; reduced for numbers beyond :data:`MAX_EXACT_INTEGER`.
-        """
+        """Add an array, and return its placeholder ``{"array": index}`` for the page's data."""
         values = np.asarray(values, dtype=np.float64)
         largest_value = float(np.max(np.abs(values), initial=1.0))
         while largest_value * scale > MAX_EXACT_INTEGER:
@@ -50,11 +40,10 @@ class Packer:
         zigzag = ((differences << 1) ^ (differences >> 63)).astype("<u8")
         plane_count = max(1, (int(zigzag.max(initial=0)).bit_length() + 7) // 8)
         self._bytes.append(zigzag.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes())
-        self.specs.append((len(values), plane_count, scale))
-        return {"array": len(self.specs) - 1}
+        self.array_specs.append((len(values), plane_count, scale))
+        return {"array": len(self.array_specs) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
-        """Add times (s), in whole microseconds if they are multiples of them."""
         is_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
         return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)
 

@@ -12,25 +12,14 @@ from px4fuse.explore.packing import Packer
 from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 
-# Maximum length (characters) of a text from a log; longer texts are shortened
+# Maximum length (characters) of a text from a log
 MAX_LOG_TEXT_LENGTH = 2000
 SCRIPT_NAMES = ("card", "step", "times")
 PACKAGE = "px4fuse.explore"
 
 
 def html_text(analysis: Analysis) -> str:
-    """Make the page of an analysis.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Analysis of one flight, with the request.
-
-    Returns
-    -------
-    str
-        HTML page, to be written as UTF-8.
-    """
+    """Make the explore page (HTML) of an analysis."""
     packer = Packer()
     data, card = flight_data(analysis, packer), card_of(analysis)
     identity = card.identity
@@ -46,20 +35,9 @@ def html_text(analysis: Analysis) -> str:
 
 
 def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
-    """Return HTML elements with the data of one flight, which browsers neither execute nor show.
-
-    Parameters
-    ----------
-    data : dict
-        From :func:`px4fuse.explore.data.flight_data`.
-    analysis : Analysis
-    packer : Packer
-        Packer of the arrays in the data.
-    suffix : str
-        Suffix of the element ids, for pages with several flights.
-    """
+    """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
     document, places = document_json(data, analysis)
-    content = {"flight": data, "ranges": ranges(), "packed": packer.specs, "places": places}
+    content = {"flight": data, "ranges": ranges(), "packed": packer.array_specs, "places": places}
     figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
     return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
@@ -83,24 +61,20 @@ def page_text(
     flight_count: int = 0,
     choices: Mapping[str, str] = {},
 ) -> str:
-    """Make the HTML page with the data elements.
+    """Make the HTML page of one flight, or of a practice set.
 
     Parameters
     ----------
     data_elements : str
-        Script elements from :func:`data_scripts`.
+        Result of :func:`data_scripts` for each flight.
     data : dict
-        Data of any flight of the page: either all have ground truth or none has.
-    command, title, about : str
-        Command, file, and description of the flight in the header.
+        Data of one of the flights.
+    about : str
+        Description of the flight in the header.
     card : str
-        HTML of the diagnosis card; empty if the page shows it after an answer.
-    sha256 : str
-        SHA-256 of the log, in the head of the page.
-    flight_count : int
-        Number of flights in a practice set; 0 on other pages.
-    choices : mapping of str to str
-        Possible answers with their texts; empty for a page without questions.
+        Diagnosis card (HTML); empty for a practice set.
+    choices : mapping
+        Answers of a practice set and their texts.
     """
     practice = "practice" if choices else "no_practice"
     scripts_by_name = {

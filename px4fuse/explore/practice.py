@@ -28,14 +28,13 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Pairs of right answers that one flight can combine: the first injected fault affects the whole
-# flight, the second single samples. A wrong noise would hide another fault, so it is not combined
+# Pairs of answers whose injected faults can occur in one flight without hiding each other
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# Scenario of the simulated flights: less than a minute, with two turns. The IMU errors are small,
-# because large errors would resemble a time offset or a misaligned position frame
+# Scenario of the simulated flights: less than a minute, with two turns. Large IMU errors would
+# resemble a time offset or a misaligned position frame
 SCENARIO_VALUES: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -45,7 +44,7 @@ SCENARIO_VALUES: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-# Smallest and largest length (m) of a pass along the aisle, which is drawn for each flight
+# Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
 # Finding of the analysis that contains the time span of each injected fault
 FINDING_WITH_TIME = {
@@ -53,13 +52,12 @@ FINDING_WITH_TIME = {
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-# Name of the injected fault "SIGMA_Z of KF is too small", which is a wrong setting and no fault in
-# the log
+# Name of the fault "SIGMA_Z of KF is too small", which is a wrong setting and not in the log
 NOISY_UWB = "noisy-uwb"
 
 
 class HiddenMistake(Record, frozen=True):
-    """Injected fault in a practice flight that the student has to identify.
+    """Injected fault in a practice flight.
 
     Attributes
     ----------
@@ -68,17 +66,9 @@ class HiddenMistake(Record, frozen=True):
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
     sizes : tuple of str
-        Size for each level of difficulty, as after ``px4fuse simulate --mistake NAME=``.
+        Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
     view : str
-        View of the page that shows the injected fault.
-    fault : str
-        Description of the injected fault for the student.
-    size_text : str
-        Text of the size; {0} and {1} are replaced by the numbers in ``sizes``.
-    symptom : str
-        Effect on the plots, and the setting that confirms the injected fault.
-    has_either_sign : bool
-        True if the sign of the size is drawn at random.
+        Tab of the page that shows the fault.
     """
 
     choice: str
@@ -92,7 +82,7 @@ class HiddenMistake(Record, frozen=True):
 
 
 class MistakeTable(Record, frozen=True):
-    """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
+    """Answers of the quiz with their texts, and the injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
@@ -104,17 +94,7 @@ FAULT_CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
 
 @dataclass(frozen=True)
 class PracticeFlight:
-    """Simulated flight of the practice page.
-
-    Attributes
-    ----------
-    scenario : Scenario
-        Settings of the simulation.
-    mistakes : tuple of HiddenMistake
-        No, one or two injected faults with different right answers.
-    sizes : tuple of str
-        Sizes of the injected faults, as after ``px4fuse simulate --mistake NAME=``.
-    """
+    """Simulated flight of the practice page, with the sizes of its injected faults."""
 
     scenario: Scenario
     mistakes: tuple[HiddenMistake, ...]
@@ -122,20 +102,18 @@ class PracticeFlight:
 
     @property
     def correct_answers(self) -> list[str]:
-        """Right answers about the injected faults of the flight, sorted."""
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
-def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
-    """Draw random practice flights; each injected fault is the right answer equally often.
+def draw_flights(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
+    """Draw random practice flights, in which all faults are equally frequent.
 
     Parameters
     ----------
     seed : int
         Random seed; the same seed, level and count give the same flights.
     level : {1, 2, 3}
-        Level of difficulty: a large injected fault (1), a smaller one (2), or up to two small ones
-        (3).
+        Difficulty: one large fault (1), one smaller fault (2), or up to two small faults (3).
     count : int
         Number of flights.
     """
@@ -176,13 +154,13 @@ def practice_text(
     count: int = 10,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
-    """Simulate the flights of :func:`draw`, and return the practice page (HTML) about them.
+    """Simulate the flights of :func:`draw_flights`, and return the practice page (HTML).
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
     scripts = []
     data: dict[str, Any] = {}
-    for number, practice_flight in enumerate(draw(seed, level, count)):
+    for number, practice_flight in enumerate(draw_flights(seed, level, count)):
         progress(f"flight {number + 1}", number, count)
         data, script = _flight_data(practice_flight, number)
         scripts.append(script)
@@ -198,7 +176,6 @@ def practice_text(
 
 
 def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
-    """Return the plot data of a flight, and HTML elements with the data and the right answer."""
     mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
     options = [
         f"{mistake.mistake}={size}"
@@ -208,7 +185,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     simulation = flights.simulate(practice_flight.scenario, parse(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # a corrected frame would hide the injected fault
+    # as_sent: an automatic correction of the frame would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
     descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
@@ -225,7 +202,6 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Describe an injected fault: size, time, symptom, and the view of the page that shows it."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
@@ -249,7 +225,6 @@ def size_in_words(size: str) -> list[str]:
 
 
 def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
-    """Replace the headline of the diagnosis if the analysis did not detect the injected fault."""
     if card.causes or not descriptions:
         return card
     fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
@@ -257,5 +232,5 @@ def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Car
         card,
         severity="warning",
         headline=fault[0].upper() + fault[1:],
-        do_this=("None of the automatic checks finds this mistake. Compare the plots.",),
+        do_this=("None of the automatic checks finds this fault. Compare the plots.",),
     )

@@ -1,10 +1,7 @@
-"""Findings: mistakes and conditions of a flight that the log shows.
+"""Findings: faults of a flight that the log shows.
 
-Each module declares the thresholds (with unit and source) of related findings. Its function
-``detect`` yields the findings of a flight, with message, action and evidence.
-
-To add a finding: write a module with ``detect`` and add it to :data:`DETECTORS`; add title, group
-and meaning to ``catalogue.toml``, and the rates to ``tests/studies/rates.csv``.
+To add a finding: yield it in the function ``detect`` of a module in :data:`DETECTORS`, add title,
+group and meaning to ``catalogue.toml``, and its rates to ``tests/studies/rates.csv``.
 """
 
 from collections.abc import Mapping
@@ -51,7 +48,6 @@ __all__ = [
     "group_by_root",
 ]
 
-# Modules of the detectors; group_by_cause orders their findings
 DETECTORS = (
     aids,
     ekf2_noise,
@@ -89,16 +85,16 @@ def find_loop(loop: Loop) -> tuple[Finding, ...]:
 
 
 def find_aids(results: Mapping[str, AidResult], ekf2: object = None) -> tuple[Finding, ...]:
-    """Return the findings about EKF2 and its aids, for a flight without position source."""
+    """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
     findings = list(aids.detect_in_aids(results))
-    if isinstance(ekf2, Ekf2):  # the first entry is the instance at the start
+    if isinstance(ekf2, Ekf2):
         span_s = ekf2.instances[0][0], ekf2.instances[-1][0]
         findings += ekf2_resets.detect_instance_switches(ekf2, span_s)
     return group_by_cause(findings)
 
 
 def finding_title(finding: str) -> str:
-    """Return the title of a finding id; for an unknown id, the id with blanks.
+    """Return the title of a finding, or its id with blanks if the id is unknown.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

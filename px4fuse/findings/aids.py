@@ -1,7 +1,4 @@
-"""Findings about aiding sources of EKF2: not fused, overconfident, shifted or biased.
-
-External vision position and height are tested by other modules, which replay EKF2.
-"""
+"""Faults of EKF2's aiding sources: not fused, σ too small, biased or shifted innovations."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,23 +8,23 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first, format_number, format_ratio
+from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import WINDOW_S, AidResult
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
+# External vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 may ignore the barometer: ground effect changes the pressure
 TAKE_OFF_S = 10.0
-# Minimum ratio of EKF2's largest height error in a gap of the barometer to its height RMSE outside
-# the gap, for severity warning
+# Minimum ratio of EKF2's largest height error in a barometer gap to its height RMSE outside the gap
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with the flag for a bad vertical acceleration, for severity note
-MAX_SHORT_BAD_ACCELERATION = 0.3
+# Fraction of the time with a bad vertical acceleration above which the finding is a warning
+MAX_BAD_FRACTION_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
@@ -53,7 +50,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -> Findings:
-    """Detect that EKF2 declared its vertical acceleration bad in the analysed segment."""
+    """Detect that EKF2 flagged its vertical acceleration as bad."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.record, Unavailable):
         return
@@ -67,22 +64,20 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Random innovations can set this state for some seconds."
-    remedy = "If it lasts longer than some seconds, check the IMU for vibration and clipping."
+    cause = "Random innovations can set this flag for some seconds."
+    remedy = "If it lasts longer, check the IMU for vibration and clipping."
     if noises:
-        cause = "EKF2 assumes too small a noise for these sensors."
+        cause = "EKF2's noise parameters of these sensors are too small."
         remedy = f"Increase {' and '.join(sorted(noises))} to the true noise."
-    share, start_s = float(is_bad.mean()), float(times[is_bad.argmax()])
-    is_long = share > MAX_SHORT_BAD_ACCELERATION
+    bad_fraction, start_s = float(is_bad.mean()), float(times[is_bad.argmax()])
     yield finding(
-        "warning" if is_long else "note",
+        "warning" if bad_fraction > MAX_BAD_FRACTION_NOTE else "note",
         "ekf2_acceleration_bad",
-        f"EKF2 declares its vertical acceleration bad for {format_percent(share)} of the time, "
-        f"first at {start_s:.0f} s. Barometer and GNSS both measure that the vehicle is above "
-        "EKF2's height. EKF2 then distrusts the accelerometer and keeps its bias constant. "
-        f"{cause}",
+        f"EKF2 flags its vertical acceleration as bad for {format_percent(bad_fraction)} of the "
+        f"time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
+        f"EKF2 estimates. {cause}",
         remedy,
-        {"fraction": share, "start_s": start_s},
+        {"fraction": bad_fraction, "start_s": start_s},
     )
 
 
@@ -92,18 +87,10 @@ def detect_in_aids(
     take_off_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
-    """Detect faults of EKF2's aiding sources, at most one for each of them.
+    """Detect faults of EKF2's aiding sources.
 
-    Parameters
-    ----------
-    aids : mapping from aid name to AidResult
-    source_aid : str
-        Aiding source whose positions KF also uses; other modules test its variance.
-    take_off_s : sequence of float
-    Times of take-off.
-    height_error_m : float or None
-        EKF2's largest height error (m) in the longest gap of the barometer; None if unknown or
-        not larger than usual.
+    ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` EKF2's height
+    error in the longest gap of the barometer if it is larger than in the rest of the flight.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     not_fused: dict[str, list[AidResult]] = {}
@@ -119,7 +106,7 @@ def detect_in_aids(
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
         is_barometer, effect = switch == BAROMETER.switch, ""
         if is_barometer and height_error_m is not None:
-            effect = f", with a height error of {height_error_m:.2f} m"
+            effect = f". EKF2's height error is {height_error_m:.2f} m"
         yield finding(
             "note" if is_barometer and not effect else "warning",
             "aid_not_fused",
@@ -143,11 +130,10 @@ def detect_in_aids(
             s_sqrt = aid.axes[axis].s_sqrt_median
             yield warning(
                 "aid_innovation_shift",
-                f"{capitalise_first(label)}: the {axis} innovation shifts by "
+                f"{label}: the {axis} innovation shifts by "
                 f"{format_number(abs(shift) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. The mean "
                 f"innovation before and after differs by {abs(shift):.1f} √S (√S "
-                f"{format_number(s_sqrt, 2)} {aid.unit}). EKF2 changes its states until the "
-                "innovation is small again.",
+                f"{format_number(s_sqrt, 2)} {aid.unit}).",
                 f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
                 ((time_s, time_s + WINDOW_S),),
@@ -158,13 +144,16 @@ def detect_in_aids(
             action = "Then correct the accuracy that the sensor reports."
             if noise_parameter := AIDS[name].noise:
                 action = f"Then increase {noise_parameter}."
+            noise = ""
+            if aid.noise is not None:
+                noise = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
             yield warning(
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
                 f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), "
                 f"and {format_percent(aid.rejected_fraction)} of the samples are rejected. The "
-                f"errors of this aiding source are larger than R{_format_noise(aid)}, or another "
-                "aiding source is wrong.",
+                f"errors of this aiding source are larger than its √R{noise}, or another aiding "
+                "source is wrong.",
                 f"Check delay and mounting of the sensor first. {action}",
                 {
                     "aid": name,
@@ -179,7 +168,7 @@ def detect_in_aids(
             )
             yield note(
                 "aid_innovation_bias",
-                f"{capitalise_first(label)}: the {axis} innovation has a mean of "
+                f"{label}: the {axis} innovation has a mean of "
                 f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
                 f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
                 "contradicts another one.",
@@ -194,7 +183,6 @@ def detect_in_aids(
 
 
 def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
-    """Return EKF2's largest height error (m) in a time span, if it is unusually large."""
     down = analysis.axes.get("down")
     errors = None if down is None else position_errors(down, "ekf2")
     if errors is None or isinstance(errors, Unavailable):
@@ -202,7 +190,7 @@ def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
-    largest_m = float(error_m[is_in_span].max())  # NaN if all errors in the span are unknown
+    largest_m = float(error_m[is_in_span].max())
     return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
 
 
@@ -211,11 +199,4 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source_aid: str) -> str:
-    """Return SENSOR if an aiding source and KF's positions come from the same sensor."""
     return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
-
-
-def _format_noise(aid: AidResult) -> str:
-    if aid.noise is None:
-        return ""
-    return f" (√R {format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"

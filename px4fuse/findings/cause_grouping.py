@@ -1,4 +1,4 @@
-"""Order of the findings in a report: each cause is followed by the findings that it explains."""
+"""Order of the findings in a report: each cause is followed by its effects."""
 
 from collections.abc import Iterable, Mapping
 
@@ -8,7 +8,7 @@ from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import TITLES, group_by_root
 
-# Key in Finding.evidence whose value is the kind of cause that re-runs of a filter have shown
+# Key in Finding.evidence: kind of cause that a re-run has confirmed
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,19 +20,19 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: ratio of the source's white noise to the measurement noise that a filter
-# assumes. Only a large ratio is stored; the assumed noise is then a separate fault
+# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes (only if large)
 WHITE_RATIO = "white_over_assumed"
-# Values of CAUSE in a finding about an aiding source: it belongs to the same sensor as the
-# positions of KF, or its mean innovation changes in flight
-SENSOR, CHANGE = "the source's sensor", "change"
-# Value of CAUSE in the finding ekf2_resets if each position reset follows a gap in the source
+# Kind of cause: the aiding source and the positions of KF are from the same sensor
+SENSOR = "the source's sensor"
+# Kind of cause: the mean innovation of the aiding source changes in flight
+CHANGE = "change"
+# Kind of cause: each position reset of EKF2 follows a gap in the position source
 GAP = "gap"
-# Key in Finding.evidence of findings about axes, unit, clock or orientation of the source, which
-# precede all other findings
+# Kind of cause: the vehicle stayed on the ground
+GROUND = "never took off"
+# Key in Finding.evidence: wrong axes, unit, clock or orientation of the source
 CONVENTION = "convention"
-# Findings that are listed before all others: they make all estimates from the IMU or the positions
-# invalid
+# Findings that make all estimates invalid, so they are listed first
 WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
 UNUSABLE = (
     *WRONG_IMU,
@@ -44,14 +44,12 @@ UNUSABLE = (
     "source_relocalises",
     "source_timestamps_shared",
 )
-# Key in Finding.evidence of the time (s) at which the source announced a jump by its reset_counter
+# Key in Finding.evidence: time (s) of a position jump with an increment of reset_counter
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
-# Causes whose action replaces the actions of their effects
+# Findings to be corrected first: their action is printed instead of the actions of their effects
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
-# Kind of cause of no_motion: the vehicle stayed on the ground
-GROUND = "never took off"
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
 NOISES = frozenset(
@@ -66,7 +64,7 @@ NOISES = frozenset(
         "process_noise_near_zero",
     )
 )
-# Effects of a finding, by its id; one effect per line: "id", or "id: value of CAUSE"
+# Ids of the effects of each finding, one per line
 CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
 RECORDING = frozenset(
     {
@@ -89,18 +87,16 @@ RECORDING = frozenset(
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings in the order of correction: each cause is followed by its effects.
-
-    Findings are sorted by severity, then in the order of :data:`TITLES`. A cause is at least as
-    severe as the findings that it explains.
-    """
+    """Sort findings by severity; each cause is followed by its effects."""
     ids = list(TITLES)
     groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
     for cause, effects in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
-        if cause_group is None or (cause_group[0].severity == "note" and cause in CORRECTED_FIRST):
-            continue
-        if WHITE_RATIO in cause_group[0].evidence:
+        if (
+            cause_group is None
+            or (cause_group[0].severity == "note" and cause in CORRECTED_FIRST)
+            or WHITE_RATIO in cause_group[0].evidence
+        ):
             continue
         effect_groups = [
             group
@@ -114,7 +110,6 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         for effect, *further_effects in effect_groups:
             remedy = cause_group[0].remedy if cause in CORRECTED_FIRST else effect.remedy
             cause_group += [replace(effect, caused_by=cause, remedy=remedy), *further_effects]
-        # kf_underconfident and kf_overconfident do not increase the severity of their cause
         severities = (
             effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES
         )
@@ -124,13 +119,11 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def effect_ids(cause: str) -> tuple[str, ...]:
-    """Return the ids of the findings that one finding can cause, without duplicates."""
     effects = CONSEQUENCES.get(cause, "").splitlines()
     return tuple(dict.fromkeys(effect.partition(":")[0] for effect in effects))
 
 
 def _report_rank(group: list[Finding]) -> int:
-    # gaps in the recording falsify noise estimates: warnings in RECORDING precede errors in NOISES
     cause = group[0]
     is_first = CONVENTION in cause.evidence or cause.id in (
         *UNUSABLE,
@@ -140,5 +133,6 @@ def _report_rank(group: list[Finding]) -> int:
     )
     if is_first and cause.severity != "note":
         return -1
+    # a damaged recording falsifies noise estimates, so it is listed before wrong noises
     ranks = {"error": 2 * (cause.id in NOISES), "warning": 3 - 2 * (cause.id in RECORDING)}
     return ranks.get(cause.severity, 4)

@@ -25,7 +25,6 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 
 def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
-    """Return the kind of cause that a re-run shows; ELSEWHERE without a re-run."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
@@ -45,7 +44,6 @@ def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
 
 
 def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
-    """Return True if a re-run along the main axis shows that the change improves nothing."""
     return any(
         (trial.filter, trial.change) == (owner, cause.change)
         and can_improve(trial)
@@ -55,7 +53,7 @@ def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
 
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
-    """Format the changes of a re-run, for example "SIGMA_Z 0.1 m instead of 0.05 m"."""
+    """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
     return " and ".join(
         _format_one_change(analysis, cause, name)
         for name in cause.change
@@ -63,8 +61,8 @@ def format_change(analysis: Analysis, cause: Trial) -> str:
     )
 
 
-def format_explained_share(cause: Trial, statistic: Statistic) -> str:
-    """Format the fraction of ln(mean NIS or NEES) that a change explains."""
+def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
+    """Format how much of ln(mean NIS or NEES) a change removes."""
     if contradicts_truth(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and is_sufficient(cause, statistic):
@@ -76,7 +74,6 @@ def format_explained_share(cause: Trial, statistic: Statistic) -> str:
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Format the action for a change, with one sentence for each changed quantity."""
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS, None):
@@ -109,7 +106,7 @@ def format_shift(shift_s: float) -> str:
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:
-    """Format KF noises as an action, for example "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)"."""
+    """Format the action "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
     texts = (
         f"{name[:7].upper()} to {value:g} {SETTING_UNITS[name]} "
         f"({COMPARISON_OPTIONS[name]} {value:g})"
@@ -125,8 +122,8 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
         case trials.CLOCK_OFFSET:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
-            late = "late" if offset_s < 0 else "early"
-            return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
+            direction = "late" if offset_s < 0 else "early"
+            return f"timestamps corrected ({abs(offset_s):.2g} s {direction})"
         case trials.FORWARD_BIAS:
             right = cause.change[trials.RIGHT_BIAS]
             return (
@@ -143,9 +140,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
         case changes.SIGMA_A | changes.SIGMA_Z:
             label, unit = name[:7].upper(), SETTING_UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
-    # re-runs of EKF2 need its model
     assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
-    return f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}".replace(
-        "  ", " "
-    ).rstrip()
+    text = f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}"
+    return text.replace("  ", " ").rstrip()

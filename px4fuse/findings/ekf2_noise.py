@@ -1,8 +1,4 @@
-"""EKF2 measurement noise parameter of the position source that is too small or too large.
-
-A replay of EKF2 confirms the fault. For GNSS, KF takes SIGMA_Z from the same parameter, so both
-filters may have the fault.
-"""
+"""EKF2 measurement noise parameter that is too small or too large, confirmed by a replay."""
 
 import math
 
@@ -16,42 +12,42 @@ from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum ratio of flown to estimated noise (σ), or inverse, for severity error: a smaller ratio
-# hardly changes EKF2's position error
-MIN_RATIO_ERROR = 2.0
-# Minimum fraction of rejected positions for the finding's title to state it
+# Minimum factor between EKF2's noise and its estimate for severity error: a smaller factor hardly
+# changes EKF2's position error
+MIN_FACTOR_ERROR = 2.0
+# Minimum fraction of rejected positions that the title states
 MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect an EKF2 measurement noise whose correction makes EKF2's innovations consistent."""
+    """Detect a wrong measurement noise of EKF2: a replay with the estimate is consistent."""
     trial, aid = confirmed_noise_trial(analysis), aid_of(analysis)
     if trial is None:
         return
-    assert not isinstance(analysis.ekf2_model, Unavailable)  # a re-run of EKF2 needs its model
+    assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
-    size, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
+    factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
     sensor = source_name(analysis.source)
     is_shared = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )
     rejected = analysis.main.rejected_fraction or 0.0
     if rejected >= MIN_NAMED_REJECTION:
-        effect = f": EKF2 rejects {format_percent(rejected)} of the positions"
-        reason = f"EKF2 rejects ordinary {sensor} noise as outliers and relies on the IMU."
+        effect_text = f": EKF2 rejects {format_percent(rejected)} of the positions"
+        reason = f"EKF2 rejects normal {sensor} noise as outliers and relies on the IMU."
     else:
-        effect, gain = "", "large" if is_small else "small"
+        effect_text, gain = "", "large" if is_small else "small"
         reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
-    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
+    title = f"{aid.noise} is {format_factor(factor)} times too {direction}{effect_text}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
     if is_small and is_default:  # with PX4's default, name the sensor, not the parameter
         assumed = "KF and EKF2 assume" if is_shared else "EKF2 assumes"
-        title = f"{sensor} noise is {format_factor(size)} times what {assumed}{effect}"
+        title = f"{sensor} noise is {format_factor(factor)} times what {assumed}{effect_text}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(tuned, AxisTuning) and tuned.sigma_z.low and tuned.sigma_z.high:
         interval = f" (95 % {tuned.sigma_z.low:.3g} to {tuned.sigma_z.high:.3g} m)"
-    severity: Severity = "error" if size >= MIN_RATIO_ERROR else "warning"
+    severity: Severity = "error" if factor >= MIN_FACTOR_ERROR else "warning"
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",

@@ -5,7 +5,7 @@ import pandas as pd
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
     EV_START_INTERVAL_S,
     EV_STOP_INTERVAL_S,
@@ -25,23 +25,19 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
 from px4fuse.flight.position_source import POSITION_FILE
 
-# Minimum fraction of the time in which EKF2 fuses the source. Below it the severity is error,
-# because EKF2 uses other sensors most of the time
-MIN_FUSING_SHARE_ERROR = 0.5
-# Minimum fraction of the analysed time with fusion of the source without a finding: 2 % of a minute
-# are about 1 s
-MIN_FUSING_SHARE_WARNING = 0.98
-# Minimum interval (s) between positions that may delay the start of fusion: with 10 % jitter, an
-# interval reaches EV_START_INTERVAL_S
+# Fraction of the time in which EKF2 fuses the source, below which the severity is error
+MIN_FUSED_FRACTION_ERROR = 0.5
+# Fraction of the time below which the severity is warning: 2 % of a minute are about 1 s
+MIN_FUSED_FRACTION_WARNING = 0.98
+# Position interval (s) above which EKF2 may start fusion late: 10 % jitter reaches
+# EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of EKF2 from ground truth or source for a finding of an invalid position:
-# before take-off the distance is smaller
+# Minimum distance (m) from EKF2 to ground truth or source for the finding of an invalid position
 MIN_INVALID_DISTANCE_M = 1.0
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect an invalid position of EKF2, and a source that EKF2 does not fuse."""
     if is_height_only(analysis.source):
         return
     if isinstance(analysis.flight.ekf2, Ekf2):
@@ -50,23 +46,22 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def detect_missing_fusion(analysis: Comparison) -> Findings:
-    """Detect that EKF2 did not fuse the source, or only in a part of the segment."""
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
-    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
+    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
-    fusing = ekf2.fusing["horizontal"]
-    share = fraction_on(fusing, analysis.segment)
-    if share >= MIN_FUSING_SHARE_ERROR:
+    fusing = ekf2.fusion_flags["horizontal"]
+    fused_fraction = fraction_on(fusing, analysis.segment)
+    if fused_fraction >= MIN_FUSED_FRACTION_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusing)
-    if source is None or share >= MIN_FUSING_SHARE_WARNING:
+    if source is None or fused_fraction >= MIN_FUSED_FRACTION_WARNING:
         return
     positions, aid = positions_of(source), source.origin.aid
     evidence: dict[str, float | str] = {
-        "fused_fraction": share,
+        "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.rate_hz,
     }
     if aid is None:
-        if source.name == MOTION_CAPTURE_TOPIC and not share:
+        if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield warning(
                 "ekf2_not_fusing",
                 f"EKF2 never fused the {positions}: EKF2 does not read {source.name}. PX4 writes "
@@ -85,11 +80,11 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     action = unmet.action
     if not unmet.condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
-    extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
-    if not share:
-        extent = f"EKF2 never fused the {positions}"
-    message = f"{extent}{unmet.fault and ': '}{unmet.fault}. {unmet.reason}"
-    if share < MIN_FUSING_SHARE_ERROR:
+    title = f"EKF2 fused the {positions} only {format_percent(fused_fraction)} of the time"
+    if not fused_fraction:
+        title = f"EKF2 never fused the {positions}"
+    message = f"{title}{unmet.fault and ': '}{unmet.fault}. {unmet.reason}"
+    if fused_fraction < MIN_FUSED_FRACTION_ERROR:
         is_reference = source.origin.fused_as_gnss and unmet.condition == "switch"
         yield finding(
             "note" if is_reference else "error",
@@ -97,7 +92,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
             message,
             action,
             evidence,
-            spans if share else (),
+            spans if fused_fraction else (),
         )
     else:
         yield warning(
@@ -111,7 +106,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
 
 
 def _received_source(analysis: Comparison) -> PositionTrack | None:
-    """Return the source that PX4 received; a position file did not reach PX4."""
+    """Return the positions that PX4 received; a position file did not reach PX4."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
@@ -122,8 +117,8 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     is_valid = ekf2.states.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
-    share = 1.0 - fraction_on(is_valid, analysis.segment)
-    if share <= 1.0 - MIN_FUSING_SHARE_WARNING:
+    invalid_fraction = 1.0 - fraction_on(is_valid, analysis.segment)
+    if invalid_fraction <= 1.0 - MIN_FUSED_FRACTION_WARNING:
         return
     spans = spans_with_value(0.0, is_valid, analysis.segment)
     distance_m = _largest_distance_m(analysis, ekf2, spans)
@@ -134,22 +129,19 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if not np.isfinite(distance_m):
         distance = ""
     yield finding(
-        "error" if share > MIN_FUSING_SHARE_ERROR else "warning",
+        "error" if invalid_fraction > MIN_FUSED_FRACTION_ERROR else "warning",
         "ekf2_position_invalid",
-        f"EKF2's horizontal position is invalid {format_percent(share)} of the time. EKF2 sets "
-        f"xy_valid to 0, and PX4 does not use the position.{distance}",
+        f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
+        f"(xy_valid 0), and PX4 does not use it.{distance}",
         "Restore the fusion of positions first. EKF2's errors in this time do not depend on "
         "noise settings.",
-        {"invalid_fraction": share, "distance_m": distance_m},
+        {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
         spans,
     )
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return EKF2's largest horizontal distance (m) to ground truth, else to the source.
-
-    Return NaN without samples in the spans.
-    """
+    """Return EKF2's largest horizontal distance (m) to ground truth, else to the source."""
     truth, axes = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     state = pd.concat([ekf2.state[axes].loc[start:end] for start, end in spans])
@@ -161,11 +153,15 @@ def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
-    """Detect that EKF2 resumed fusion late after a gap, as the position rate is too low."""
+    """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
     source = analysis.source
-    is_limited = "EKF2_EV_CTRL" in analysis.flight.log.parameters  # v1.14 and later
-    is_known = source.origin.is_vision and source.origin.has_all_samples and not source.alignment
-    if not (is_limited and is_known) or 1.0 / source.rate_hz < MIN_LIMITING_INTERVAL_S:
+    if (
+        "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
+        or not source.origin.is_vision
+        or not source.origin.has_all_samples
+        or source.alignment
+        or 1.0 / source.rate_hz < MIN_LIMITING_INTERVAL_S
+    ):
         return
     time_s = source.samples.index.to_numpy()
     resumed_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
@@ -181,7 +177,7 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
         longest_s = max(end - start for start, end in late_spans)
         yield note(
             "source_rate_at_limit",
-            f"{capitalise_first(positions_of(source))} come at {source.rate_hz:.1f} Hz, so EKF2 "
+            f"{positions_of(source)} come at {source.rate_hz:.1f} Hz, so EKF2 "
             f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
             f"fusion only if two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",

@@ -13,30 +13,27 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
-# rejects a fraction of 6e-7
-REJECTED_SHARE_WARNING = 0.01
+# rejects 6e-7
+REJECTED_FRACTION_WARNING = 0.01
 # Minimum fraction of rejected samples for severity error: R or the time offset must be wrong
-REJECTED_SHARE_ERROR = 0.20
-# Maximum ratio of the rejected fraction with a change to that as flown, for a change that prevents
-# rejections
+REJECTED_FRACTION_ERROR = 0.20
+# A changed setting prevents rejections if it reduces their fraction to this part
 MAX_REJECTED_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect rejected positions or heights, and a gate that is too small."""
     rejections = tuple(_detect_rejections(analysis))
     yield from _detect_small_gate(analysis, rejections)
     yield from rejections
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate that would reject 1 % of the samples of a consistent filter."""
+    """Detect a gate that would reject more than 1 % of the samples of a consistent filter."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
-        # EKF2 accepts a sample if both normally distributed innovations are inside the gate:
-        # erf(gate/√2)²
-        expected = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
-        if expected >= REJECTED_SHARE_WARNING:
+        # EKF2 accepts a sample if the innovations north and east are inside the gate: erf(gate/√2)²
+        expected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
+        if expected_fraction >= REJECTED_FRACTION_WARNING:
             aid = aid_of(analysis)
             rejected = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
@@ -44,10 +41,10 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects {format_percent(rejected)} "
                 "of the positions. Without any fault, this gate rejects "
-                f"{format_percent(expected)} of the positions. Rejected positions do not correct "
-                "EKF2.",
+                f"{format_percent(expected_fraction)} of the positions. Rejected positions do not "
+                "correct EKF2.",
                 f"Set {aid.gate} to {aid.default_gate:g} (PX4's default).",
-                {"gate": ekf2.gate, "rejected_by_gate": expected},
+                {"gate": ekf2.gate, "rejected_by_gate": expected_fraction},
             )
 
 
@@ -59,17 +56,21 @@ def _detect_rejections(analysis: Analysis) -> Findings:
         if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
         rejected_flags = innovations["rejected"].dropna()
-        share = float(rejected_flags.mean())  # NaN if the log has no rejections
-        if share >= REJECTED_SHARE_WARNING:
+        rejected_fraction = float(rejected_flags.mean())  # NaN if the log has no rejections
+        if rejected_fraction >= REJECTED_FRACTION_WARNING:
             quantity = "heights" if result is down else "positions"
             yield finding(
-                "error" if share >= REJECTED_SHARE_ERROR else "warning",
+                "error" if rejected_fraction >= REJECTED_FRACTION_ERROR else "warning",
                 "ekf2_rejects_positions",
-                f"EKF2 rejects {format_percent(share)} of the {quantity}. Their innovations are "
-                f"beyond its gate of {ekf2.gate:g} √S. Possible causes: outliers, measurement "
-                "noise set too small, or late timestamps.",
+                f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
+                f"innovations are outside its gate of {ekf2.gate:g} √S. Possible causes: outliers, "
+                "measurement noise set too small, or late timestamps.",
                 _remedy(analysis, result),
-                {"rejected_fraction": share, "count": len(innovations), "axis": result.axis.name},
+                {
+                    "rejected_fraction": rejected_fraction,
+                    "count": len(innovations),
+                    "axis": result.axis.name,
+                },
                 zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 

@@ -17,7 +17,6 @@ AFTER_GAP_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect position resets and instance changes in the segment."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
@@ -31,10 +30,13 @@ def detect(analysis: Analysis) -> Findings:
     ]
     if resets:
         horizontal = [reset for reset in resets if any(reset.delta[:2])]
-        counted = horizontal or resets
-        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in counted]
-        follows_gap = all(_follows_gap(analysis, reset) for reset in counted)
-        at_s = counted[int(np.argmax(sizes_m))].time_s
+        resets_to_report = horizontal or resets
+        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in resets_to_report]
+        follows_gap = all(
+            any(start <= reset.time_s <= end + AFTER_GAP_S for start, end in analysis.events.gaps)
+            for reset in resets_to_report
+        )
+        at_s = resets_to_report[int(np.argmax(sizes_m))].time_s
         _, treatment = continuous_state(ekf2, analysis.source, analysis.segment)
         if treatment:
             treatment = f" In the comparison: {treatment}."
@@ -42,16 +44,16 @@ def detect(analysis: Analysis) -> Findings:
             "warning" if horizontal else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal else 'height'} "
-            f"{format_count(len(counted))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
+            f"{format_count(len(sizes_m))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
             f"{at_s:.1f} s.{treatment}",
             f"Run px4fuse explore LOG and compare position and innovation at {at_s:.1f} s.",
             {
-                "count": len(counted),
+                "count": len(sizes_m),
                 "largest_m": max(sizes_m),
                 "at_s": at_s,
                 CAUSE: GAP if follows_gap else ELSEWHERE,
             },
-            zero_length_spans(reset.time_s for reset in counted),
+            zero_length_spans(reset.time_s for reset in resets_to_report),
         )
     yield from detect_instance_switches(ekf2, (segment.start_s, segment.end_s))
 
@@ -75,7 +77,3 @@ def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
         start_s <= reset.time_s <= start_s + TAKE_OFF_S
         for start_s, _ in airborne_spans(analysis.flight)
     )
-
-
-def _follows_gap(analysis: Analysis, reset: Reset) -> bool:
-    return any(start <= reset.time_s <= end + AFTER_GAP_S for start, end in analysis.events.gaps)

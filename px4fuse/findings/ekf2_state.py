@@ -1,4 +1,4 @@
-"""States and flags of EKF2 that explain its errors: biases of the IMU, and missing alignment."""
+"""IMU biases that EKF2 cannot estimate, and a tilt or heading that EKF2 did not align."""
 
 import numpy as np
 import pandas as pd
@@ -12,50 +12,47 @@ from px4fuse.findings.model import Findings, error, format_percent, fraction_on,
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable
 
-# Limits of the bias states (m/s², rad/s): parameter, unit, sensor and columns
+# Parameter with the limit of a bias state, its unit, sensor, and columns of the bias
 BIAS_STATES = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# Minimum ratio of a bias state and its limit, for a state at the limit
+# Fraction of its limit above which a bias state is at the limit
 AT_LIMIT = 0.98
-# Minimum fraction of the flight with a bias state at its limit
-MIN_LIMITED_SHARE = 0.5
-# Length (s) of the windows in which the IMU is tested for rest, and time (s) before take-off that
-# is not tested, because the motors run
-REST_WINDOW_S, RUN_UP_S = 1.0, 0.5
+# Minimum fraction of the flight with a bias state at its limit for a finding
+MIN_LIMITED_FRACTION = 0.5
+# Length (s) of the windows in which the IMU is tested for rest
+REST_WINDOW_S = 1.0
+# Time (s) before take-off in which the motors run, so the IMU is not at rest
+RUN_UP_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
 MAX_REST_STD = (0.04, 1.5)
-# Maximum difference (rad/s) between the mean angular rates of the windows at rest
+# Maximum change (rad/s) of the angular rate at rest
 MAX_REST_CHANGE_RAD_S = 0.01
-# Minimum gyroscope bias (rad/s) that EKF2 does not estimate: its heading turns by 90° in 30 s
+# Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
 GRAVITY_M_S2 = 9.80665
-# Minimum difference (m/s²) between gravity and the specific force at rest
+# Minimum difference (m/s²) between gravity and the specific force at rest that a message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without alignment: 2 % of a minute are about 1 s
-MAX_UNALIGNED_SHARE = 0.02
+# Maximum fraction of the flight without alignment for no finding: 2 % of a minute are about 1 s
+MAX_UNALIGNED_FRACTION = 0.02
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect biases that EKF2 cannot estimate, and a tilt or heading that is not aligned."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
     at_rest = measure_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
-        states = cut_to_segment(ekf2.record.delayed, analysis.segment)
-        if len(states):
-            yield from _detect_limited_bias(analysis, ekf2, states, at_rest)
-            yield from _detect_gyro_bias(states, at_rest)
+        bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
+        if len(bias_states):
+            yield from _detect_limited_bias(analysis, ekf2, bias_states, at_rest)
+            yield from _detect_gyro_bias(bias_states, at_rest)
     yield from _detect_missing_alignment(analysis, ekf2)
 
 
 def measure_at_rest(flight: Flight) -> pd.Series | None:
-    """Return the mean angular rate and specific force at rest before take-off, by column name.
-
-    None without a second of rest.
-    """
+    """Return the median angular rate and specific force at rest before take-off, if known."""
     if not isinstance(flight.imu, pd.DataFrame) or not flight.airborne:
         return None
     if isinstance(flight.airborne, Unavailable):
@@ -75,18 +72,19 @@ def measure_at_rest(flight: Flight) -> pd.Series | None:
 
 
 def _detect_limited_bias(
-    analysis: Analysis, ekf2: Ekf2, states: pd.DataFrame, at_rest: pd.Series | None
+    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, at_rest: pd.Series | None
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_STATES:
         limit = ekf2.parameters.get(parameter, 0.0)
-        shares = (states[columns].abs() >= AT_LIMIT * limit).mean().to_numpy()
-        axis = int(np.argmax(shares))
-        if limit <= 0.0 or shares[axis] < MIN_LIMITED_SHARE:
+        fractions = (bias_states[columns].abs() >= AT_LIMIT * limit).mean().to_numpy()
+        axis = int(np.argmax(fractions))
+        limited_fraction = float(fractions[axis])
+        if limit <= 0.0 or limited_fraction < MIN_LIMITED_FRACTION:
             continue
-        bias = float(states[columns[axis]].median())
+        bias = float(bias_states[columns[axis]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(float(shares[axis]))} of the flight. The estimate is {bias:+.3g} "
+            f"{format_percent(limited_fraction)} of the flight. The estimate is {bias:+.3g} "
             f"{unit} {BODY_AXES[axis]}; EKF2 cannot estimate a larger bias."
         )
         if sensor == "accelerometer" and at_rest is not None:
@@ -101,12 +99,11 @@ def _detect_limited_bias(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
-            {"bias": bias, "limit": limit, "limited_fraction": float(shares[axis])},
+            {"bias": bias, "limit": limit, "limited_fraction": limited_fraction},
         )
 
 
 def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
-    """Return sentences on EKF2's height error and barometer innovation; empty if unknown."""
     text, down = "", analysis.axes.get("down")
     truth = None if down is None else down.filters["ekf2"].truth
     if isinstance(truth, ErrorsAgainstTruth):
@@ -119,11 +116,11 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
     return text
 
 
-def _detect_gyro_bias(states: pd.DataFrame, at_rest: pd.Series | None) -> Findings:
+def _detect_gyro_bias(bias_states: pd.DataFrame, at_rest: pd.Series | None) -> Findings:
     if at_rest is None:
         return
     measured: Array = at_rest[Columns.ANGULAR_RATE].to_numpy()
-    estimated: Array = states[Columns.GYRO_BIAS].median().to_numpy()
+    estimated: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
     axis = int(np.argmax(np.abs(measured - estimated)))
     if abs(measured[axis] - estimated[axis]) < MIN_GYRO_BIAS_RAD_S:
         return
@@ -139,7 +136,7 @@ def _detect_gyro_bias(states: pd.DataFrame, at_rest: pd.Series | None) -> Findin
 
 
 def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
-    fusing, segment = ekf2.fusing, analysis.segment
+    fusing, segment = ekf2.fusion_flags, analysis.segment
     has_own_yaw = analysis.source.frame == "FRD" or (
         isinstance(fusing, pd.DataFrame) and fraction_on(fusing["yaw"], segment) > 0.0
     )
@@ -157,16 +154,20 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
         steps = ekf2.states.get(flag)
         if steps is None or (flag == "yaw_align" and has_own_yaw):
             continue
-        share = 1.0 - fraction_on(steps, segment)
-        if share > MAX_UNALIGNED_SHARE:
+        unaligned_fraction = 1.0 - fraction_on(steps, segment)
+        if unaligned_fraction > MAX_UNALIGNED_FRACTION:
             spans = spans_with_value(0.0, steps, segment)
-            until = "" if share > 1.0 - MAX_UNALIGNED_SHARE else f" until {spans[-1][1]:.1f} s"
+            until = (
+                ""
+                if unaligned_fraction > 1.0 - MAX_UNALIGNED_FRACTION
+                else f" until {spans[-1][1]:.1f} s"
+            )
             yield error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until}. cs_{flag} is 0 for "
-                f"{format_percent(share)} of the flight, and EKF2 fuses no position before "
-                f"{'tilt' if flag == 'tilt_align' else 'tilt and heading'} are aligned.",
+                f"{format_percent(unaligned_fraction)} of the flight. EKF2 fuses no position "
+                f"before {'tilt is' if flag == 'tilt_align' else 'tilt and heading are'} aligned.",
                 action,
-                {"unaligned_fraction": share, "flag": flag},
+                {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,
             )

@@ -1,8 +1,7 @@
-"""Position errors that innovations do not show: against ground truth, and drift of the source.
+"""Position errors that innovations do not show: errors against ground truth, drift of the source.
 
 Innovations compare a filter with its position source, so they do not show an error of the source
-that the filter follows. NEES is the squared error against ground truth divided by the reported
-variance (expected 1).
+that the filter follows.
 """
 
 from collections.abc import Mapping
@@ -34,11 +33,10 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: position errors of 4 reported σ
 MIN_NEES_ERROR = 16.0
-# Maximum ratio of the position RMSEs of KF and EKF2 for a fault of EKF2 alone: the common source
-# then causes at most half of EKF2's mean square error
+# EKF2 alone is at fault if the position RMSE of KF is below this fraction of EKF2's
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum ratio of the position RMSE after alignment to that before, for a misaligned frame
-MAX_ALIGNED_SHARE = 0.5
+# A frame is misaligned if an alignment reduces the position RMSE below this fraction
+MAX_ALIGNED_FRACTION = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
     "loop LOG) corrects the path of this flight, not the filters."
@@ -76,8 +74,7 @@ class AlignedError(NamedTuple):
 
     @property
     def is_misaligned(self) -> bool:
-        """True if a misaligned frame causes most of the position error."""
-        return self.after_m < MAX_ALIGNED_SHARE * self.before_m
+        return self.after_m < MAX_ALIGNED_FRACTION * self.before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -100,25 +97,23 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect position errors that innovations do not show, else a source that may drift."""
-    if hidden := find_hidden_errors(analysis):
-        yield make_error_finding(analysis, hidden)
+    if hidden_errors := find_hidden_errors(analysis):
+        yield make_error_finding(analysis, hidden_errors)
     elif analysis.source.origin.may_drift:
         yield make_possible_drift_finding(analysis)
 
 
 def make_error_finding(
-    analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
+    analysis: Analysis, hidden_errors: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    """Make the finding of position errors larger than the reported σ."""
-    hidden = sorted(hidden, key=lambda entry: entry[1] != analysis.main.axis.name)
-    (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
+    hidden_errors = sorted(hidden_errors, key=lambda entry: entry[1] != analysis.main.axis.name)
+    worst_filter, main_axis, worst = hidden_errors[0]
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratios, sentences = dict[str, float](), list[str]()
     causes = dict[FilterName, Trial]()
     for filter_name in FILTERS:
         label = filter_name.upper()
-        for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
+        for _, axis, excess in [entry for entry in hidden_errors if entry[0] == filter_name][:1]:
             if excess.nis_mean is not None:
                 evidence[f"{filter_name}_nis_mean"] = excess.nis_mean
             evidence |= {
@@ -144,7 +139,7 @@ def make_error_finding(
             "position_rmse_aligned_m": aligned.after_m,
         }
     is_misaligned = aligned is not None and aligned.is_misaligned
-    if may_drift and not causes and not is_misaligned:
+    if analysis.source.origin.may_drift and not causes and not is_misaligned:
         return _drift_finding(analysis, aligned, worst, evidence)
     if is_misaligned and aligned is not None:
         sentences.append(f"The position frame is misaligned: horizontal position RMSE {aligned}.")
@@ -153,7 +148,7 @@ def make_error_finding(
         isinstance(kf_truth, ErrorsAgainstTruth)
         and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
     )
-    is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden)
+    is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden_errors)
     remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
     if cause is not None:
         remedy = format_action(analysis, cause.change)
@@ -189,11 +184,10 @@ def _drift_finding(
     if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
-        share = format_percent(gap_m / length_m, 1)
         sentence = "" if aligned is None else f"Horizontal position RMSE {aligned}. "
         size = (
             f"loop closure error {format_metres(gap_m)} m after a path of {length_m:.0f} m "
-            f"({share})"
+            f"({format_percent(gap_m / length_m, 1)})"
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
@@ -223,9 +217,9 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
         true_track.append(np.interp(errors.index, truth.index, truth["position_m"]))
     if len(error) < 2:
         return None
-    zero_height, known = np.zeros(len(error[0])), np.isfinite(error).all(axis=0)
+    zero_height, is_known = np.zeros(len(error[0])), np.isfinite(error).all(axis=0)
     error_m, true_m = (
-        np.column_stack([*columns, zero_height])[known] for columns in (error, true_track)
+        np.column_stack([*columns, zero_height])[is_known] for columns in (error, true_track)
     )
     try:
         aligned_m = fit_alignment(true_m + error_m, true_m, "yaw").apply(true_m + error_m)
@@ -238,20 +232,17 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    """Make the note that odometry may drift."""
     sensor, loop = source_name(analysis.source), analysis.loop
     tuned = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: its messages contain a heading, as with odometry. Innovations show "
-        f"how well a filter follows {sensor}, not the position error."
+        f"{sensor} may drift: its messages contain a heading, so it may be odometry. Innovations "
+        f"show how well a filter follows {sensor}, not the position error."
     )
     if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
-        bound = "at most " if tuned.sigma_z.value is None else ""
+        prefix = "at most " if tuned.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise}
-        message += (
-            f" The noise between successive positions is {bound}{noise:.2g} m, without the drift."
-        )
+        message += f" The position noise without drift is {prefix}{noise:.2g} m."
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
         message += (

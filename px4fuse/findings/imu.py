@@ -15,7 +15,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Minimum accelerometer bias (m/s²) for severity error: its position error is 0.15 m after 1 s
 BIAS_ERROR_M_S2 = 0.3
-# Tilt error (°) with the same effect as an accelerometer bias of 1 m/s²
+# Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 # Minimum time (s) without IMU samples for a finding: two prediction steps of KF
 MIN_IMU_GAP_S = 0.2
@@ -34,7 +34,6 @@ RATE_MARGIN = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the IMU data and of the attitude."""
     yield from detect_tumbling(analysis)
     yield from detect_bias(analysis)
     yield from detect_clipping(analysis)
@@ -67,7 +66,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # if positions were fitted, they show no horizontal bias: use EKF2's bias along down only
+        # the fitted positions show no horizontal bias
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )
@@ -87,8 +86,8 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = cut_to_segment(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
-    return None if inside.empty else [float(median) for median in inside.median()]
+    samples = cut_to_segment(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
+    return None if samples.empty else samples.median().tolist()
 
 
 def detect_tumbling(analysis: Analysis) -> Findings:
@@ -128,13 +127,12 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    """Detect gaps of the IMU that are longer than two prediction steps of KF."""
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
-        # KF needs IMU and attitude; without a gap in the IMU the attitude is missing
+        # KF needs IMU and attitude
         missing = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
@@ -186,7 +184,6 @@ def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
 
 
 def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
-    """Return True if the sample rate is more than 2 % below the needed rate."""
     return sample_rate(samples) < RATE_MARGIN * needed_hz
 
 

@@ -1,23 +1,21 @@
 """False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-# Maximum fraction of loop closures that robust optimisation rejects: above it, the stated odometry
-# drift is too small
-MAX_DROPPED_SHARE = 0.5
+# Fraction of loop closures rejected by robust optimisation above which the stated odometry drift is
+# too small
+MAX_DROPPED_FRACTION = 0.5
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-# Minimum GNC weight of a loop closure that is not rejected: final weights are near 0 or 1 (Yang et
-# al. 2020)
+# Weight below which graduated non-convexity (GNC) rejects a loop closure; final weights are near 0
+# or 1 (Yang et al. 2020)
 MIN_KEPT_WEIGHT = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the loop of a flight, if the flight has a loop."""
     if isinstance(analysis.loop, Loop):
         yield from detect_in_loop(analysis.loop)
 
@@ -29,15 +27,15 @@ def detect_in_loop(loop: Loop) -> Findings:
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
-    """Detect loop closures that contradict the drift or other loop closures."""
+    """Detect loop closures that do not fit the odometry drift or the other loop closures."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
     dropped_count = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
-    drops_most = dropped_count > MAX_DROPPED_SHARE * len(weights)
+    drops_most = dropped_count > MAX_DROPPED_FRACTION * len(weights)
     if drops_most:
         yield warning(
             "loop_drift_too_small",
-            f"Robust optimisation rejects {dropped_count} of {len(weights)} loop closures. "
-            "Odometry drift above the stated drift is more likely than so many false closures.",
+            f"Robust optimisation rejects {dropped_count} of {len(weights)} loop closures. The "
+            "stated odometry drift is probably too small.",
             "Increase the stated drift (--drift or --heading-drift).",
             {"dropped": dropped_count, "closures": len(weights)},
         )
@@ -47,7 +45,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         elif weight < MIN_KEPT_WEIGHT and not drops_most:
             yield warning(
                 "loop_closure_inconsistent",
-                f"{capitalise_first(str(closure))} contradicts the other loop closures. Robust "
+                f"{closure!s} contradicts the other loop closures. Robust "
                 "optimisation rejects it, although drift could explain its closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
                 _evidence(closure) | {"gnc_weight": weight},
@@ -55,7 +53,6 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
 
 
 def detect_assumptions(loop: Loop) -> Findings:
-    """Detect a loop on positions that do not drift, and an assumed landing place."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.is_absolute_track:

@@ -13,7 +13,6 @@ DEFAULT_PROFILE, VISION_PROFILE_BIT = 1, 128
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect data that are missing from the log."""
     yield from detect_unavailable_data(analysis)
     yield from detect_source_not_logged(analysis)
 
@@ -45,7 +44,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 
 def detect_source_not_logged(analysis: Comparison) -> Findings:
-    """Detect that the log lacks the positions as PX4 received them."""
+    """Detect a log without the positions as PX4 received them."""
     source, preference = analysis.source, RECEIVED.preference
     is_logged = any(track.origin.preference == preference for track in analysis.flight.positions)
     if source.origin.has_all_samples or is_logged:

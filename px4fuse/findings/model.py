@@ -9,19 +9,20 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.record import Record, Span, table
+from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
 
 
 class CatalogueEntry(Record, frozen=True):
-    """Title, group (one of :data:`GROUPS`) and meaning of a finding."""
+    """Title, meaning and group of a finding; ``group`` is one of :data:`GROUPS`."""
 
     title: str
     meaning: str
     group: str = "position source"
 
 
-# Catalogue of findings by id; findings of equal severity are listed in this order
+# All findings by id; findings of equal severity are listed in this order
 CATALOGUE: Mapping[str, CatalogueEntry] = table(
     __file__, "catalogue.toml", dict[str, CatalogueEntry]
 )
@@ -30,17 +31,16 @@ TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.item
 
 
 class Example(Record, frozen=True):
-    """Example of a finding, with detection and false alarm rates (tests/studies/rates.csv).
+    """Example of a finding, with its false alarms and detection rates (tests/studies/rates.csv).
 
     Attributes
     ----------
-    message, remedy : str
-        Message and action on one flight.
-    clean_flights, false_alarms : int
-        Number of simulated flights without a mistake, and number of these with the finding.
+    clean_flights : int
+        Number of simulated flights without an injected fault.
+    false_alarms : int
+        Number of these flights with the finding.
     detection : dict
-        Fraction of the simulated flights with a mistake that have the finding, by the mistake as
-        an option of `px4fuse simulate`, or as a setting of KF.
+        Fraction of the flights with an injected fault that have the finding, by name of the fault.
     """
 
     message: str
@@ -51,7 +51,6 @@ class Example(Record, frozen=True):
 
 
 def load_examples() -> Mapping[str, Example]:
-    """Load the example of each finding, by id; docs/findings_pages.py makes the file."""
     return msgspec.json.decode(
         Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
     )
@@ -69,6 +68,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
+    message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 
@@ -77,7 +77,6 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Split findings into groups: a finding without a cause, followed by its effects."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:
@@ -91,7 +90,6 @@ def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
 
 
 def lower_severity(severity: Severity) -> Severity:
-    """Lower a severity by one level."""
     return "warning" if severity == "error" else "note"
 
 
@@ -103,21 +101,20 @@ def format_percent(fraction: float, digits: int = 0) -> str:
     return f"{100.0 * fraction:.{digits}f} %"
 
 
-def spans_with_value(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Return the spans of a segment in which a step function has a given value.
-
-    Before its first time the step function has its first value.
-    """
-    edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
+def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
+    """Return the time spans of a segment in which a step function has a value."""
+    edges = np.clip(
+        np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
+    )
     edges[0] = segment.start_s
     is_inside = np.diff(edges) > 0.0
-    has_value = np.concatenate([[False], steps.to_numpy()[is_inside] == value, [False]])
+    has_value = np.concatenate([[False], step_function.to_numpy()[is_inside] == value, [False]])
     edges = np.append(edges[:-1][is_inside], segment.end_s)
     changes = edges[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
     return tuple(zip(changes[::2], changes[1::2], strict=True))
 
 
-def fraction_on(steps: pd.Series, segment: Segment) -> float:
+def fraction_on(step_function: pd.Series, segment: Segment) -> float:
     """Return the fraction of a segment in which a 0/1 step function is 1."""
-    on_s = sum(end - start for start, end in spans_with_value(1.0, steps, segment))
+    on_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
     return on_s / (segment.end_s - segment.start_s)

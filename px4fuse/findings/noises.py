@@ -1,9 +1,7 @@
 """Findings about wrong SIGMA_Z or SIGMA_A of KF, and about over- or underconfident KF or EKF2.
 
-The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can: a
-wrong SIGMA_A correlates successive innovations, a wrong SIGMA_Z hardly does. Both are estimated,
-and a re-run shows which change improves KF. For a default setting the severity is one level lower
-than for a setting chosen by the user.
+SIGMA_A and SIGMA_Z are estimated together by maximum likelihood, because the mean NIS cannot
+separate them.
 """
 
 from typing import NamedTuple
@@ -46,26 +44,25 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum ratio of a noise setting to its estimate, or inverse, for a warning: below, the track
-# hardly changes
-MIN_NOISE_RATIO = 1.5
-# Minimum ratio of a noise setting to its estimate, or inverse, for severity error
-MIN_NOISE_RATIO_ERROR = 4.0
-# Minimum response time (s) of a KF with Q almost zero: vehicles turn faster
+# Minimum factor between a noise setting and its estimate for a warning: a smaller factor hardly
+# changes the track
+MIN_NOISE_FACTOR = 1.5
+# Minimum factor between a noise setting and its estimate for severity error
+MIN_NOISE_FACTOR_ERROR = 4.0
+# Time constant (s) of KF above which Q is almost zero: vehicles turn faster
 MIN_RESPONSE_TIME_S = 2.5
 # Factor on the 95 % interval of a noise estimate (log scale): 0.3 % of correct settings are outside
 INTERVAL_WIDENING = 1.5
-# Minimum lag-1 autocorrelation of the innovations of a lagging KF: white innovations have below 0.2
+# Lag-1 autocorrelation of the innovations above which KF lags; white innovations have below 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
-# Minimum ratio of actual to reported σ, or inverse, for severity error
-MIN_SIGMA_RATIO_ERROR = 2.0
-# Maximum ratio of two values of a noise that count as equal: two standard errors of a median of 100
-# values
+# Minimum factor between actual and reported σ for severity error
+MIN_SIGMA_FACTOR_ERROR = 2.0
+# Noises within this factor are equal: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# Minimum ratio of √R to EKF2_EVP_NOISE for an R that EKF2 takes from the position messages
+# EKF2 takes R from the position messages if √R exceeds EKF2_EVP_NOISE by this factor
 MIN_REPORTED_RATIO = 1.25
-# Actions for an over- or underconfident filter whose cause no re-run shows
+# Actions if no re-run explains the wrong σ
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
@@ -83,12 +80,12 @@ KEEP_NOISES_CORRELATED = (
 KEEP_NOISES_TRUTH = (
     "Do not reduce noise settings: σ would become smaller than the errors against ground truth."
 )
-# Effect on KF of a noise setting that is too small or too large, and reason
+# Effect of a wrong noise setting on KF, and its reason
 SETTING_EFFECTS = {
     (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
     (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
     (SIGMA_A, "small"): (
-        "KF lags the motion",
+        "KF lags behind the motion",
         "P grows too little between updates, so the gain is too small.",
     ),
     (SIGMA_A, "large"): (
@@ -101,63 +98,51 @@ Member = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
-    """Deviation of a noise setting from its maximum-likelihood estimate.
+    """Factor (at least 1) between a noise setting and its estimate or its upper bound."""
 
-    Attributes
-    ----------
-    value : float
-        Maximum-likelihood estimate, or its upper bound.
-    size : float
-        Setting over ``value``, or its inverse: at least 1.
-    severity : Severity
-    """
-
-    value: float
-    size: float
+    estimate: float
+    factor: float
     severity: Severity
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect wrong noise settings of KF, then inconsistent variances of KF and EKF2."""
     yield from detect_wrong_settings(analysis)
     yield from detect_process_noise_near_zero(analysis)
     yield from detect_inconsistent_variances(analysis)
 
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
-    """Detect noise settings of KF outside the widened 95 % interval of their estimate.
-
-    If SIGMA_A and SIGMA_Z are both wrong, the larger deviation is the cause of the smaller one.
-    """
+    """Detect a SIGMA_A or SIGMA_Z that differs significantly from its estimate."""
     axis_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
-    chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
+    settings = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
     ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
     wrong_settings = {
         name: deviation
         for name, noise in ml_noises.items()
-        if (deviation := setting_deviation(name, chosen[name], noise))
+        if (deviation := setting_deviation(name, settings[name], noise))
     }
-    # if the source has drift or time-correlated errors, or ground truth shows larger errors, then
-    # innovations show only that a noise is too small, not that it is too large
-    may_drift, has_slow_errors = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
+    # innovations do not show drift or time-correlated errors, so they cannot show that a noise is
+    # too large
+    may_drift = analysis.source.origin.may_drift
     if (
         may_drift
-        or has_slow_errors
+        or analysis.source.origin.is_gnss
         or any(filter_name == "kf" for filter_name, *_ in find_hidden_errors(analysis))
     ):
         wrong_settings = {
             name: deviation
             for name, deviation in wrong_settings.items()
-            if chosen[name] < deviation.value and not (may_drift and deviation.severity == "note")
+            if settings[name] < deviation.estimate
+            and not (may_drift and deviation.severity == "note")
         }
     cause = None
     findings = [
         _setting_finding(analysis, axis_tuning, name, deviation)
-        for name, deviation in sorted(wrong_settings.items(), key=lambda item: -item[1].size)
+        for name, deviation in sorted(wrong_settings.items(), key=lambda item: -item[1].factor)
     ]
     for setting_finding in sorted(findings, key=lambda item: SEVERITIES.index(item.severity)):
         yield structs.replace(setting_finding, caused_by=cause)
@@ -167,23 +152,22 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
 def _setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
 ) -> Finding:
-    """Make the finding of a wrong noise setting of KF."""
-    value, size, severity = deviation
-    chosen = getattr(analysis.settings, name)
+    estimate, factor, severity = deviation
+    setting = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
-    direction, is_bound = "small" if chosen < value else "large", noise.value is None
-    effect, mechanism = SETTING_EFFECTS[name, direction]
-    action = format_setting_action(analysis, name, value)
+    direction, is_bound = "small" if setting < estimate else "large", noise.value is None
+    effect, reason = SETTING_EFFECTS[name, direction]
+    action = format_setting_action(analysis, name, estimate)
     return finding(
         "note" if action == NO_IMPROVEMENT else severity,
         f"{name[:7]}_too_{direction}",
-        f"{name[:7].upper()} is {'at least ' if is_bound else ''}{format_factor(size)} times "
-        f"too {direction}: {effect}. {format_estimate(name, chosen, noise)}. {mechanism}",
+        f"{name[:7].upper()} is {'at least ' if is_bound else ''}{format_factor(factor)} times "
+        f"too {direction}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
         action,
         {
-            "chosen": chosen,
-            "most_likely": value,
-            "factor": chosen / value,
+            "chosen": setting,
+            "most_likely": estimate,
+            "factor": setting / estimate,
             "lag1_autocorrelation": getattr(
                 axis_tuning.before, "lag1_autocorrelation", float("nan")
             ),
@@ -191,21 +175,16 @@ def _setting_finding(
     )
 
 
-def format_estimate(name: str, chosen: float, noise: Noise) -> str:
-    """Format a setting with its maximum-likelihood estimate and 95 % interval."""
+def format_estimate(name: str, setting: float, noise: Noise) -> str:
     label, unit = name[:7].upper(), SETTING_UNITS[name]
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
     if noise.value is not None and noise.high:
         value += f" (95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit})"
-    return f"{label} is {chosen:g} {unit}; its maximum-likelihood estimate is {value}"
+    return f"{label} is {setting:g} {unit}; its maximum-likelihood estimate is {value}"
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
-    """Format the action for a wrong noise setting of KF.
-
-    If no re-run could show an improvement, the action is a run with the estimate.
-    """
     if trial := find_trial(analysis.main_trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
@@ -217,7 +196,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
-def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
+def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate; None if not significant."""
     if not (value := ml_noise.value or ml_noise.high):
         return None
@@ -225,26 +204,25 @@ def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDevia
         (0.0, value) if ml_noise.value is None else (ml_noise.low or 0.0, ml_noise.high or np.inf)
     )
     low, high = (value * (end / value) ** INTERVAL_WIDENING for end in (low, high))
-    size = max(chosen / value, value / chosen)
-    if low <= chosen <= high or size < MIN_NOISE_RATIO:
+    factor = max(setting / value, value / setting)
+    if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
-    severity: Severity = "error" if size >= MIN_NOISE_RATIO_ERROR else "warning"
-    return SettingDeviation(
-        value, size, lower_severity(severity) if chosen == getattr(Settings(), name) else severity
-    )
+    severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_ERROR else "warning"
+    if setting == getattr(Settings(), name):  # a default is not a mistake of the user
+        severity = lower_severity(severity)
+    return SettingDeviation(value, factor, severity)
 
 
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
-    """Detect a SIGMA_A so small that KF ignores new positions.
-
-    Without motion such a filter is correct, so a finding needs innovations that are correlated and
-    too large.
-    """
+    """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        if isinstance(summary, Unavailable) or summary.verdict != "overconfident":
-            continue
-        if summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION:
+        # without motion such a filter is correct, and its innovations are small and white
+        if (
+            isinstance(summary, Unavailable)
+            or summary.verdict != "overconfident"
+            or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
+        ):
             continue
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
         response_s = 1.0 / (sample_rate(updates) * gain)
@@ -252,29 +230,23 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
         axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
-        title, estimate = f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero", ""
+        title, estimate_text = f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero", ""
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (ml_sigma_a := axis_tuning.sigma_a_two_state.value):
             title = f"SIGMA_A is {format_factor(ml_sigma_a / sigma_a)} times too small"
-            estimate = f"{format_estimate(SIGMA_A, sigma_a, axis_tuning.sigma_a_two_state)}. "
+            estimate_text = f"{format_estimate(SIGMA_A, sigma_a, axis_tuning.sigma_a_two_state)}. "
             action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"{title}: KF ignores new positions. {estimate}The process noise is almost zero, so "
-            f"the gain falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a position "
-            "change.",
+            f"{title}: KF ignores new positions. {estimate_text}The gain falls to {gain:.2g}. KF "
+            f"needs {response_s:.0f} s to follow a position change.",
             action,
-            {
-                "gain": gain,
-                "response_s": response_s,
-                "axis": result.axis.name,
-            },
+            {"gain": gain, "response_s": response_s, "axis": result.axis.name},
         )
         return
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    """Detect that KF or EKF2 is overconfident or underconfident."""
     for filter_name in FILTERS:
         for is_underconfident in (True, False):
             first_id = None
@@ -295,13 +267,12 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
 def _variance_finding(
     analysis: Analysis, filter_name: FilterName, group: str, members: list[Member]
 ) -> Finding:
-    """Make the finding of an inconsistent filter along a group of axes."""
     result, summary = max(
         members,
         key=lambda pair: (pair[0] is analysis.main, abs(np.log(pair[1].nis_mean))),
     )
     is_underconfident, factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
-    severity: Severity = "error" if factor >= MIN_SIGMA_RATIO_ERROR else "warning"
+    severity: Severity = "error" if factor >= MIN_SIGMA_FACTOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
         severity = lower_severity(severity)
     axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
@@ -327,13 +298,6 @@ def _variance_finding(
         cause = kind_of_cause(analysis, rerun)
         remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
-    evidence: dict[str, float | str] = {
-        "axis": result.axis.name,
-        "sigma_ratio": summary.sigma_ratio,
-        "nis_mean": summary.nis_mean,
-        "fraction_outside_gate": summary.fraction_outside_gate,
-        CAUSE: cause,
-    }
     low, high = summary.nis_band
     return finding(
         severity,
@@ -343,12 +307,17 @@ def _variance_finding(
         f"NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
         "axes).",
         remedy_text,
-        evidence,
+        {
+            "axis": result.axis.name,
+            "sigma_ratio": summary.sigma_ratio,
+            "nis_mean": summary.nis_mean,
+            "fraction_outside_gate": summary.fraction_outside_gate,
+            CAUSE: cause,
+        },
     )
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    """Format the action if EKF2's GNSS noise exceeds the receiver's σ and the estimated noise."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
@@ -367,7 +336,6 @@ def _format_excessive_noise(analysis: Analysis) -> str:
 
 
 def _noise_minimum(analysis: Analysis) -> str:
-    """Describe EKF2's minimum noise of vision positions; empty unless GNSS determines it."""
     parameters = analysis.flight.log.parameters
     gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
     is_besides_gnss = analysis.source.origin.is_vision and fused_aid(analysis.flight.ekf2)
@@ -418,7 +386,6 @@ def _remedy(
 def _remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Format the action for EKF2's R if EKF2 was not re-run."""
     aid, noise = aid_of(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)

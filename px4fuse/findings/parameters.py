@@ -20,35 +20,39 @@ def detect(analysis: Analysis) -> Findings:
     ]
     edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     for number, (time_s, name, before, after) in enumerate(changes):
-        verdicts = [
+        verdict_before, verdict_after = (
             _verdict(analysis, *edges_s[index : index + 2]) for index in (number, number + 1)
-        ]
+        )
         unit, effect = f" {PARAMETERS[name].printed_unit}".rstrip(), ""
-        if all(verdicts):
-            effect = f" Before {time_s:.1f} s EKF2 is {verdicts[0]}, from {time_s:.1f} s on it is "
-            effect += f"{verdicts[1]} (innovations along the main axis)."
-        has_effect = verdicts[0].partition(" ")[0] != verdicts[1].partition(" ")[0]
+        if verdict_before and verdict_after:
+            effect = (
+                f" EKF2 is {verdict_before} before the change and {verdict_after} after it "
+                "(innovations along the main axis)."
+            )
+        has_effect = verdict_before.partition(" ")[0] != verdict_after.partition(" ")[0]
         yield (warning if has_effect else note)(
             "parameter_changed",
             f"{name} changed from {before:g} to {after:g}{unit} at {time_s:.1f} s.{effect}",
-            f"Evaluate both parts separately (--end {time_s:.1f}, --start {time_s:.1f}).",
+            "Analyse the flight before and after the change separately "
+            f"(--end {time_s:.1f}, --start {time_s:.1f}).",
             {"parameter": name, "before": before, "after": after, "at_s": time_s},
             ((time_s, time_s),),
         )
 
 
 def _verdict(analysis: Analysis, start_s: float, end_s: float) -> str:
-    """Return the consistency of EKF2 in a time span as text; empty if it cannot be tested."""
+    """Describe the consistency of EKF2 in a time span; "" if it cannot be tested."""
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
         return ""
-    inside = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
+    samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     result = assess(
-        inside["innovation_m"].to_numpy(), inside["innovation_variance_m2"].to_numpy(), math.inf
+        samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
-    if isinstance(result, Unavailable) or result.verdict == "consistent":
-        return "" if isinstance(result, Unavailable) else "consistent"
-    ratio, size = result.sigma_ratio, "small"
-    if ratio < 1.0:
-        ratio, size = 1.0 / ratio, "large"
-    return f"{result.verdict} (σ {format_ratio(ratio)} times too {size})"
+    if isinstance(result, Unavailable):
+        return ""
+    if result.verdict == "consistent":
+        return result.verdict
+    direction = "small" if result.sigma_ratio > 1.0 else "large"
+    factor = format_ratio(result.sigma_error_factor)
+    return f"{result.verdict} (σ {factor} times too {direction})"

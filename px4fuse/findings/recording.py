@@ -1,4 +1,4 @@
-"""Faults of the recording: lost data, restarts, clocks that were set back, other estimators."""
+"""Faults of the recording: lost data, restarts, clock jumps, and estimators other than EKF2."""
 
 import pandas as pd
 
@@ -11,7 +11,6 @@ from px4fuse.flight.model import Ekf2, Flight
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the recording."""
     yield from detect_dropouts(analysis)
     yield from detect_lost_data(analysis.flight)
     yield from detect_clocks_set_back(analysis.flight)
@@ -68,11 +67,11 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
     for topic, count in list(log.dropped.items())[:1]:
         other_count = len(log.dropped) - 1
-        other_topics = f" (other topics with such samples: {other_count})" if other_count else ""
+        other_topics = f" Other topics with such samples: {other_count}." if other_count else ""
         yield note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps. The timestamps are zero or go "
-            f"back{other_topics}, so px4fuse ignores these samples. Possible cause: a clock was "
+            f"back, so px4fuse ignores these samples.{other_topics} Possible cause: a clock was "
             "set back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": other_count + 1},

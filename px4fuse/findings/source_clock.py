@@ -14,15 +14,14 @@ from px4fuse.findings.source_stamps import find_synchronisation
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
 from px4fuse.flight.model import Unavailable
 
-# Minimum time offset (s) for an error: at 1 m/s the noise of good UWB (0.1 m)
+# Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# Maximum ratio of KF's position RMSE with the time offset corrected to that as flown, for a finding
+# No finding if a corrected time offset increases the position RMSE of KF by more than this factor
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong time offset of the positions, or a wrong EKF2_EV_DELAY."""
     clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
     if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
@@ -31,7 +30,6 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect a time offset between positions and IMU, constant or changing."""
     if find_low_pass(analysis) is not None:  # a low pass delays positions, not timestamps
         return
     low, high = clock.interval_s
@@ -75,7 +73,7 @@ def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | Non
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the ratio of the position RMSE with a change to that as flown; NaN if unknown."""
+    """Return the position RMSE of a re-run ÷ the position RMSE as flown; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
@@ -97,7 +95,6 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action that corrects the timestamps."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
@@ -105,22 +102,20 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
         return f"Run again with --clock-offset {option_s:.3f}."
     age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
     horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
-    also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
-    return f"{format_shift(clock.remaining_s)} the timestamp (usec) of each position{also}."
+    delay_action = f", and set {remedy.format_settings(horizon)}" if horizon else ""
+    shift = format_shift(clock.remaining_s)
+    return f"{shift} the timestamp (usec) of each position{delay_action}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
-    """Return the value (s) for ``--clock-offset``.
-
-    For a position file, this includes the time offset that its alignment already applied.
-    """
+    """Return the value (s) for ``--clock-offset``."""
+    # the option replaces the time offset that the alignment of a position file applied
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect an EKF2_EV_DELAY that differs from the estimated delay."""
-    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY.
+    # for GNSS, the time offset already includes an error of EKF2_GPS_DELAY
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
     if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
@@ -128,15 +123,15 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
     low, high, size = round(low_ms), round(high_ms), round(abs(ml_delay_ms))
     if low_ms <= 0.0 <= high_ms:
-        estimate = "the positions have no significant delay"
+        delay_text = "the positions have no significant delay"
     elif ml_delay_ms < 0.0:
-        estimate, low, high = f"the timestamps are {size} ms early", -high, -low
+        delay_text, low, high = f"the timestamps are {size} ms early", -high, -low
     else:
-        estimate = f"the positions are {size} ms late"
+        delay_text = f"the positions are {size} ms late"
     limit = remedy.delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
-        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {estimate}. The 95 % interval is {low} to {high} "
+        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is {low} to {high} "
         "ms. EKF2 fuses each position at the wrong time, so its track leads or lags."
         f"{f' EKF2_EV_DELAY cannot {limit}.' if limit else ''}",
         CORRECT_AT_SENDER if limit else _delay_remedy(analysis),
@@ -145,7 +140,7 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 
 def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
-    """Detect an EKF2_GPS_DELAY that differs from the delay of GNSS, with vision as reference."""
+    """Detect a wrong EKF2_GPS_DELAY if EKF2 also fuses vision."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable) or not model.agreement.good:
         return
@@ -159,9 +154,8 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
-        f"{ml_delay_ms:.0f} ms late. The σ of the estimate is {sigma_ms:.0f} ms; it is from "
-        "re-runs of EKF2, which also fuses vision. EKF2 fuses each GNSS sample at the wrong time, "
-        "so its track leads or lags.",
+        f"{ml_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with vision). EKF2 "
+        "fuses each GNSS sample at the wrong time, so its track leads or lags.",
         f"Set {remedy.format_settings({GNSS_POS.delay: round(ml_delay_ms)})}.",
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": ml_delay_ms, "sigma_ms": sigma_ms},
     )
@@ -171,14 +165,7 @@ def _delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    if not _improves(trial):
-        return CORRECT_AT_SENDER
-    return f"Set {remedy.format_settings(trial.change)}."
-
-
-def _improves(trial: Trial) -> bool:
-    """Return True if a re-run reduces the position RMSE, without ground truth the mean NIS."""
-    nis_before, nis_after = trial.before.nis_mean, trial.after.nis_mean
-    if not math.isnan(ratio := _rmse_ratio(trial)):
-        return ratio < 1.0
-    return bool(nis_before and nis_after and nis_after < nis_before)
+    ratio = _rmse_ratio(trial)
+    if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
+        ratio = trial.after.nis_mean / trial.before.nis_mean
+    return f"Set {remedy.format_settings(trial.change)}." if ratio < 1.0 else CORRECT_AT_SENDER

@@ -19,14 +19,13 @@ from px4fuse.convention.texts import (
     describe_unit,
     format_axes,
 )
-from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE, WRONG_IMU
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
 CORRECT_FIRST = "Correct the {} first."
-# Findings that are false if the source is wrong: they concern EKF2's parameters or the alignment
+# Findings that are withdrawn if the source has a wrong convention
 FALSE_AFTER = (
     "ekf2_noise_too_small",
     "ekf2_noise_too_large",
@@ -38,7 +37,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Ids of findings that remain true if the source's convention is wrong, with CORRECT_FIRST as action
+# Findings that remain true if the source has a wrong convention; their action is CORRECT_FIRST
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -53,12 +52,11 @@ EFFECTS = (
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
-# Fault of a convention: id of the finding, kind of fault, message and action
+# Id of the finding, kind of fault, message and action
 Fault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect axes, unit, timestamps or orientation of the source in a wrong convention."""
     convention, faults = analysis.convention, _faults(analysis)
     if convention is None:
         return
@@ -75,15 +73,12 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
-    """Remove the findings that a wrong convention makes false.
-
-    Findings about EKF2 remain, as effects of the wrong convention.
-    """
+    """Remove the findings that are only effects of a wrong convention, except those about EKF2."""
     faults = _faults(analysis)
-    roots = [item for item in findings if CONVENTION in item.evidence]
+    root_findings = [item for item in findings if CONVENTION in item.evidence]
     unusable = [item for item in findings if item.id in UNUSABLE]
     if unusable:
-        roots = unusable
+        root_findings = unusable
         findings = [
             item
             for item in findings
@@ -95,20 +90,30 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             )
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
-        roots = []
-    roots += [item for item in findings if item.id in MISLEADING or ANNOUNCED in item.evidence]
-    if not roots:
+        root_findings = []
+    root_findings += [
+        item for item in findings if item.id in MISLEADING or ANNOUNCED in item.evidence
+    ]
+    if not root_findings:
         return [*findings]
-    others = [item for item in findings if item not in roots and item.id not in FALSE_AFTER]
+    others = [item for item in findings if item not in root_findings and item.id not in FALSE_AFTER]
     if faults.is_ambiguous and not unusable:
-        return [*roots, *(item for item in others if item.id in EFFECTS or item.severity == "note")]
-    action = CORRECT_FIRST.format("IMU" if roots[0].id in WRONG_IMU else "position source")
+        return [
+            *root_findings,
+            *(item for item in others if item.id in EFFECTS or item.severity == "note"),
+        ]
+    action = CORRECT_FIRST.format("IMU" if root_findings[0].id in WRONG_IMU else "position source")
     effects = [
-        replace(item, message=f"{item.title}.", remedy=action, caused_by=roots[0].id)
+        replace(item, message=f"{item.title}.", remedy=action, caused_by=root_findings[0].id)
         for item in others
         if item.id in EFFECTS and item.caused_by is None
     ]
-    return [roots[0], *effects, *roots[1:], *(item for item in others if item.id not in EFFECTS)]
+    return [
+        root_findings[0],
+        *effects,
+        *root_findings[1:],
+        *(item for item in others if item.id not in EFFECTS),
+    ]
 
 
 def _faults(analysis: Comparison) -> Faults:
@@ -120,13 +125,13 @@ def _position_faults(
 ) -> Iterator[Fault]:
     positions, alignment = positions_of(source), source.alignment
     is_file = alignment is not None
-    odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
-    basis = (
+    log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
+    basis_text = (
         "The motion measured by the IMU fits this convention best (log likelihood ratio to the "
-        f"next one {'above ' if odds == 99.0 else ''}{odds:.0f})."
+        f"next best convention {'above ' if log_odds == 99.0 else ''}{log_odds:.0f})."
     )
-    stated = alignment.frame.upper() if alignment else "NED"
-    axes, turn_deg = axes_as_sent(convention.axes, stated), faults.rotation_deg
+    stated_frame = alignment.frame.upper() if alignment else "NED"
+    axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
     is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
     if faults.axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
         orientation = convention.orientation
@@ -135,22 +140,21 @@ def _position_faults(
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
             limit = "EKF2's heading came from this source, so the direction of north is unknown."
         fault, action = describe_axes(
-            axes, stated, is_mirrored=convention.is_mirrored, is_file=is_file
+            axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
         )
         if faults.axes and turn_deg:
             fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
-        yield "source_axes_wrong", "axes", f"{fault}. {basis} {limit}", action
+        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {limit}", action
     elif turn_deg:
         heading = (
             "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
         )
         message = (
-            f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {heading}. "
-            "The rotation is clockwise from above and constant. The x axis of the source is not "
-            f"north, unless this heading is wrong. {basis} The analysis uses the positions rotated "
-            "to NED."
+            f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
+            f"relative to {heading}. The x axis of the source is not north, or this heading is "
+            f"wrong. {basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -160,11 +164,11 @@ def _position_faults(
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
     if faults.unit:
-        fault, action = describe_unit(convention.unit, capitalise_first(positions), is_file=is_file)
+        fault, action = describe_unit(convention.unit, positions, is_file=is_file)
         factor = convention.scale / UNITS[convention.unit]
         message = (
-            f"{fault}. Distances are {factor:.3g} times those that the IMU measures. {basis} The "
-            "analysis uses the positions in metres."
+            f"{fault}. Distances are {factor:.3g} times those that the IMU measures. {basis_text} "
+            "The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
     late_s, percent = convention.late_s, 100.0 * faults.clock_drift
@@ -172,7 +176,7 @@ def _position_faults(
         message = (
             f"The clock of the position timestamps is {abs(percent):.1f} % "
             f"{'fast' if percent > 0 else 'slow'}, and the timestamps are {late_s:+.2f} s late in "
-            f"the middle. {basis} The analysis uses corrected timestamps."
+            f"the middle of the flight. {basis_text} The analysis uses corrected timestamps."
         )
         action = (
             "Take timestamps from a clock. Timestamps computed as frame number ÷ nominal rate "
@@ -182,7 +186,7 @@ def _position_faults(
     elif faults.late_s:
         message = (
             f"Position timestamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}. "
-            f"{basis} The analysis uses corrected timestamps."
+            f"{basis_text} The analysis uses corrected timestamps."
         )
         action = (
             "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1) and set the timestamp "
@@ -194,9 +198,9 @@ def _position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions} are not NED, and ambiguous: {axes_text}; or "
-            f"{'; '.join(convention.alternatives[:3])}. The motion of this flight fits each of "
-            "these. px4fuse estimates nothing from the positions."
+            f"The axes of the {positions} are not NED and not determined by the motion: "
+            f"{'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates nothing "
+            "from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -236,8 +240,8 @@ def _orientation_faults(
         ),
         "heading": (
             f"The heading of the orientation of {source} differs by "
-            f"{orientation.heading_error_deg or 0.0:+.0f}° from its own positions (clockwise from "
-            "above). According to IMU and orientation, the positions move in another direction",
+            f"{orientation.heading_error_deg or 0.0:+.0f}° (clockwise from above) from the heading "
+            "that its positions and the IMU show",
             "Define the rigid body with x forward. An error of 90° is often an unconverted ENU "
             "heading, which is zero at east.",
         ),

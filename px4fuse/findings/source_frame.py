@@ -1,4 +1,4 @@
-"""Position frame in FRD or misaligned, EKF2 heading errors, and alignment of a position file."""
+"""Misaligned position frame, heading errors of EKF2, and alignment of a position file."""
 
 import math
 
@@ -6,21 +6,13 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
-from px4fuse.core.text import capitalise_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
-from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
+from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight.ekf2_parameters import MAG
-from px4fuse.flight.model import (
-    Columns,
-    Ekf2,
-    Flight,
-    Unavailable,
-    positions_of,
-    source_name,
-)
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_of, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
@@ -30,8 +22,9 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of the heading drift against ground truth to that against the positions
-MIN_TRUE_DRIFT_SHARE = 0.5
+# Minimum ratio of the heading drift against ground truth to that against the positions, for a drift
+# of EKF2's heading
+MIN_TRUE_DRIFT_FRACTION = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 # EKF2_MAG_TYPE without magnetometer
@@ -41,7 +34,6 @@ CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading er
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the position frame and of EKF2's heading."""
     if analysis.source.frame == "FRD":
         yield make_frame_finding(analysis)
     heading = analysis.heading
@@ -51,21 +43,22 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of positions in a frame FRD, whose x axis is not north."""
+    """Make the finding of positions in FRD, whose x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
+    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
     fault = (
-        f"{capitalise_first(positions_of(analysis.source))} are in FRD: their x axis is the "
+        f"{positions_of(analysis.source)} are in FRD: their x axis is the "
         "heading at start, not north."
     )
     detail, action = "", f"In this report, north is the x axis of {name}."
     if isinstance(fusing, Unavailable):
         detail = f"The log does not show whether EKF2 fused the yaw of {name}."
         if log.has_ulog:
-            action += " Give the ULog, too: it shows whether EKF2 uses the same frame."
+            action += " Give the ULog, too: it shows the frame that EKF2 uses."
     elif (
-        fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR
+        fusing is not None
+        and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
         detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
     if detail:
@@ -85,16 +78,21 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         if not _is_drift_refuted(analysis.flight, heading):
             yield _drift_finding(analysis, heading)
         return
-    limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
-    if abs(rotation_deg) < limit_deg or _is_explained_by_bias(analysis):
+    fit = analysis.bias_scale_jump_fit
+    is_bias = (
+        not isinstance(fit, Unavailable)
+        and analysis.source.orientation is None
+        and abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
+    )
+    if is_bias or abs(rotation_deg) < max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG):
         return
-    positions = capitalise_first(positions_of(analysis.source))
+    positions = positions_of(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
         _, action = _gnss_heading_fault(analysis)
     elif analysis.source.name == IN_EKF2_FRAME:
-        reason = "EKF2 fused them in this frame; the IMU measures the motion in another direction."
+        reason = "EKF2 fused the positions in this frame. The IMU measures another direction."
         action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
@@ -127,20 +125,11 @@ def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
 
 
 def _calibrate(analysis: Analysis) -> str:
-    """Return the action for the magnetometer; empty if EKF2 does not use it."""
     mag_type = analysis.flight.log.parameters.get(MAG.switch)
     return "" if mag_type == NO_MAGNETOMETER else CALIBRATE
 
 
-def _is_explained_by_bias(analysis: Analysis) -> bool:
-    fit = analysis.bias_scale_jump_fit
-    if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
-        return False
-    return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
-
-
 def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
-    """Return True if EKF2's heading error against ground truth changes by less than half."""
     truth, attitude = flight.truth, flight.attitude
     if (
         isinstance(truth, Unavailable)
@@ -151,14 +140,14 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
     errors_deg = []
     for part in heading.ends:
         samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
-        true = interpolate(
+        true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
         )
-        error_rad = heading_of(samples.to_numpy()) - heading_of(true)
+        error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
         errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
     change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
-    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_SHARE * change_deg
+    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_FRACTION * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
@@ -181,7 +170,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {change:+.0f}° relative to the "
-        f"{positions_of(analysis.source)}. It is {angles[0]:+.0f}° from "
+        f"{positions_of(analysis.source)}. Its error is {angles[0]:+.0f}° from "
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
@@ -209,7 +198,7 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
         yield finding(
             severity,
             "position_file_alignment",
-            f"{capitalise_first(sentence.rstrip('.'))}.",
+            f"{sentence.rstrip('.')}.",
             "State time offset, frame and yaw of the file if known (--clock-offset, "
             "--position-frame, --position-yaw).",
         )

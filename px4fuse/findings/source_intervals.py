@@ -1,8 +1,4 @@
-"""Findings about gaps in the position source, lost positions, and a downsampled source.
-
-If only every second or third position is sent, the intervals are those of a slower source, so this
-downsampling cannot be detected.
-"""
+"""Findings about gaps in the position source, lost positions, and a downsampled source."""
 
 from collections.abc import Mapping
 
@@ -14,7 +10,7 @@ from px4fuse.comparison.comparison import reported_sigma
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.core.text import format_metres
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import state_at, variance_at
@@ -27,27 +23,27 @@ from px4fuse.flight.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
-MIN_LOST_SHARE = 0.02
+MIN_LOST_FRACTION = 0.02
 # Minimum number of intervals between positions for the detection of downsampling
 MIN_INTERVALS = 50
 # Minimum fraction of missing positions for downsampling: a radio link loses less
-MIN_DOWNSAMPLED_SHARE = 0.25
-# Minimum fraction of intervals that are one of two neighbouring multiples of the source's interval:
-# downsampling to a fixed rate causes such intervals, lost messages do not
-MIN_NEIGHBOURS_SHARE = 0.85
-# Minimum fraction of intervals that are the less frequent one of both neighbouring multiples
-MIN_MULTIPLE_SHARE = 0.1
-# Maximum RMS distance of intervals from whole multiples, in intervals of the source: jitter causes
-# 0.03, random intervals 0.29
+MIN_DOWNSAMPLED_FRACTION = 0.25
+# Downsampling to a fixed rate (30 Hz to 20 Hz) alternates between two intervals (1 and 2 periods);
+# lost messages do not. Minimum fraction of these two intervals
+MIN_NEIGHBOURS_FRACTION = 0.85
+# Minimum fraction of the less frequent one of the two intervals
+MIN_MULTIPLE_FRACTION = 0.1
+# Maximum RMS distance of intervals from whole periods, in periods: jitter causes 0.03, random
+# intervals 0.29
 MAX_MULTIPLE_RMS = 0.06
-# Maximum tested ratio of the median interval to the interval before downsampling
+# Maximum tested number of periods in the median interval
 MAX_DIVISOR = 4
-# Minimum time (s) in flight before the first or after the last position for a finding: the land
+# Minimum time (s) without positions at the start or end of the flight for a finding: the land
 # detector is seconds late
 MIN_PARTIAL_S = 3.0
-# Time (s) before a position to evaluate KF without this position
+# Time (s) from the evaluation of KF to the next position
 SMALLEST_TIME_S = 1e-6
-# Things to check after a gap in the position source, by kind of source
+# Items to check after a gap in the position source, by kind of source
 CHECKS: Mapping[PositionKind, str] = {
     "uwb": "the data link and the line of sight to the anchors",
     "vio": "the data link, and light and texture in view of the camera",
@@ -58,14 +54,13 @@ CHECKS: Mapping[PositionKind, str] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect gaps, lost positions and downsampling of the position source."""
     yield from detect_source_gaps(analysis)
     yield from detect_lost_samples(analysis)
     yield from detect_downsampling(analysis)
 
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
-    """Detect times without positions: in the source, in the log, before or after the source."""
+    """Detect times without positions."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
     spans, logged_spans = list[Span](), list[Span]()
     invalid_s = analysis.source.invalid.index
@@ -80,7 +75,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
                 yield _partial_source(analysis, span, aids)
         else:
             spans.append(span)
-    positions = capitalise_first(positions_of(source))
+    positions = positions_of(source)
     if logged_spans:
         start_s, end_s, longest = _longest(logged_spans)
         yield warning(
@@ -109,7 +104,6 @@ def _longest(gaps: list[Span]) -> tuple[float, float, str]:
 
 
 def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
-    """Return the action for positions that EKF2 fused but that the log of the source lacks."""
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
@@ -117,18 +111,19 @@ def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
 
 
 def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
-    """Report a source that begins or stops in flight."""
     (start_s, end_s), source = span_s, analysis.source
     stops = end_s == analysis.segment.flight.end_s
-    event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")
+    event, at_s, before_or_after = (
+        ("stop", start_s, "after") if stops else ("begin", end_s, "before")
+    )
     action = "" if stops or source.alignment else " Take off only when positions arrive."
     at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
     later = f"after {duration_s:.1f} s" if stops else "just before the first position"
-    effect = f", {duration_s:.1f} s {'before the end' if stops else 'after the start'}"
+    effect_text = f", {duration_s:.1f} s {'before the end' if stops else 'after the start'}"
     if "error_m" in at_end:
-        effect = f": EKF2's position error is {format_metres(at_end['error_m'])} m {later}"
+        effect_text = f": EKF2's position error is {format_metres(at_end['error_m'])} m {later}"
     elif "sigma_m" in at_end:
-        effect = f": EKF2's reported σ is {format_metres(at_end['sigma_m'])} m {later}"
+        effect_text = f": EKF2's reported σ is {format_metres(at_end['sigma_m'])} m {later}"
     has_aids, aiding = _has_aids(analysis.flight.ekf2), ""
     if has_aids:
         labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
@@ -136,16 +131,16 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     return finding(
         "error" if has_aids and not aids and duration_s > NOT_FUSED_LIMIT_S else "warning",
         "source_stops" if stops else "source_begins",
-        f"{capitalise_first(positions_of(source))} {event} in flight at {at_s:.1f} s{effect}. "
+        f"{positions_of(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
         f"{aiding}KF, RMSE and verdicts do not include this time.",
-        f"Check {CHECKS[source.origin.kind]} {when} {at_s:.1f} s.{action}",
+        f"Check {CHECKS[source.origin.kind]} {before_or_after} {at_s:.1f} s.{action}",
         {"at_s": at_s, "duration_s": duration_s, **at_end},
         (span_s,),
     )
 
 
 def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's horizontal error and reported σ (m) at the end of a span, if known."""
+    """Return EKF2's horizontal error and reported σ (m) at the end of a time span, if known."""
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squares_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
@@ -202,7 +197,6 @@ def state_errors_after(analysis: Analysis, gap_s: Span) -> str:
 
 
 def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
-    """Return True if the log shows which aiding sources EKF2 fused."""
     return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
@@ -226,14 +220,13 @@ def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
-    """Detect single positions that are missing from the recording."""
     source, clock = analysis.source, analysis.source.clock_map
     if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
         return
     intervals, typical_s = _intervals(analysis)
     lost_count = int(np.sum(np.rint(intervals / typical_s) - 1.0))
     sent_count = lost_count + len(intervals)
-    if len(intervals) > 1 and lost_count / sent_count > MIN_LOST_SHARE:
+    if len(intervals) > 1 and lost_count / sent_count > MIN_LOST_FRACTION:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
@@ -259,22 +252,22 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     if base_and_multiples is None:
         return
     base_s, multiples = base_and_multiples
-    lost_share = 1.0 - 1.0 / float(np.mean(multiples))
-    shares = np.bincount(multiples.astype(np.intp)) / len(multiples)
-    pair_shares = shares[:-1] + shares[1:]
-    multiple = int(np.argmax(pair_shares))
+    lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
+    fractions = np.bincount(multiples.astype(np.intp)) / len(multiples)
+    pair_fractions = fractions[:-1] + fractions[1:]
+    multiple = int(np.argmax(pair_fractions))
     is_alternating = (
-        pair_shares[multiple] >= MIN_NEIGHBOURS_SHARE
-        and shares[multiple : multiple + 2].min() >= MIN_MULTIPLE_SHARE
+        pair_fractions[multiple] >= MIN_NEIGHBOURS_FRACTION
+        and fractions[multiple : multiple + 2].min() >= MIN_MULTIPLE_FRACTION
     )
-    if lost_share < MIN_DOWNSAMPLED_SHARE or not is_alternating:
+    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not is_alternating:
         return
     interval_s = float(np.mean(intervals))
     is_too_slow = interval_s > EV_START_INTERVAL_S
     message = (
-        f"{capitalise_first(positions_of(source))} arrive at {1.0 / interval_s:.2g} Hz, "
+        f"{positions_of(source)} arrive at {1.0 / interval_s:.2g} Hz, "
         f"downsampled from {1.0 / base_s:.2g} Hz. The intervals are whole multiples of "
-        f"{base_s:.3g} s, so {format_percent(lost_share)} of the positions are missing."
+        f"{base_s:.3g} s, so {format_percent(lost_fraction)} of the positions are missing."
     )
     if is_too_slow:
         message += (
@@ -287,19 +280,22 @@ def detect_downsampling(analysis: Analysis) -> Findings:
         message,
         "Increase the message rate of the positions (MAVROS, bridge, link), and remove any rate "
         "limit.",
-        {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base_s, "lost_fraction": lost_share},
+        {
+            "rate_hz": 1.0 / interval_s,
+            "source_rate_hz": 1.0 / base_s,
+            "lost_fraction": lost_fraction,
+        },
     )
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
-    """Return the intervals (s) between positions without gaps, and the median interval."""
     intervals = np.diff(cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
     return intervals[intervals <= max_interval_s(typical)], typical
 
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:
-    """Return the interval (s) of the source, and the measured intervals as multiples of it."""
+    """Return the period (s) of the source, and the number of periods in each interval."""
     # the upper median is a measured interval, not a mean of two
     typical = float(np.sort(intervals)[len(intervals) // 2])
     for divisor in range(1, MAX_DIVISOR + 1):
@@ -307,7 +303,6 @@ def _base_interval(intervals: Array) -> tuple[float, Array] | None:
         if np.any(multiples < 1.0):
             continue
         base = float(np.sum(intervals) / np.sum(multiples))
-        # divisors increase, so the first match gives the longest possible source interval
         if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= MAX_MULTIPLE_RMS:
             return base, multiples
     return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.text import capitalise_first, format_number
+from px4fuse.core.text import format_number
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
@@ -19,32 +19,28 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
 
-# Minimum ratio of the white noise to the time-correlated error for the white noise to be a fault
-MIN_WHITE_SHARE = 0.3
-# Minimum gain of the log likelihood for time-correlated noise: 1 of 400 flights without a fault
+# Ratio of white to time-correlated noise above which white noise is a separate fault
+MIN_WHITE_FRACTION = 0.3
+# Minimum gain of the log likelihood by time-correlated noise: 1 of 400 flights without a fault
 # exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
 # Minimum fraction of repeated positions for a warning
-MIN_REPEAT_SHARE = 0.05
+MIN_REPEAT_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
-MIN_REPEAT_SHARE_ERROR = 0.3
+MIN_REPEAT_FRACTION_ERROR = 0.3
 # Minimum number of repeated positions for a finding
 MIN_REPEATS = 10
 # Minimum ratio of the position noises (σ) along north and east for a finding
 MIN_AXIS_RATIO = 1.5
-# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for a
-# warning
+# Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
 MIN_PART_RATIO = 2.0
-# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight,
-# without outliers, for a warning
+# Minimum ratio of the noises without outliers, for a warning
 MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the position noise (σ) in one time span to that in the rest of the flight, for
-# severity error
+# Minimum ratio of the noises for severity error
 MIN_PART_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect position noise that is not white noise with a constant σ."""
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
@@ -54,12 +50,13 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_time_correlated_noise(analysis: Analysis) -> Findings:
-    """Detect time-correlated position errors of a source that does not lag."""
     noise = analysis.time_correlated_noise
-    if not isinstance(noise, TimeCorrelatedNoise) or noise.gain_nats < MIN_CORRELATION_GAIN_NATS:
+    if (
+        not isinstance(noise, TimeCorrelatedNoise)
+        or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.lag_nats >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
+    ):
         return
-    if noise.lag_nats >= MIN_LAG_NATS:
-        return  # the source is low-pass filtered, which source_positions reports
     low, high = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
     correlation_time, interval = f"{format_number(noise.tau_s, 1)} s", f"95 % {low} to {high} s"
     if not np.isfinite(noise.high_s):
@@ -68,7 +65,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
     ratio = noise.white_m / float(np.nanmin(assumed_m))
-    if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_SHARE * noise.slow_m:
+    if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_FRACTION * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
     action = "Check multipath, anchor geometry and smoothing in the positioning system."
     if is_gnss:
@@ -87,7 +84,6 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
 
 
 def _exceeds_sigma(analysis: Analysis) -> bool:
-    """Return True if a filter is overconfident against ground truth."""
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)
@@ -108,64 +104,68 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         .to_numpy()
     )
     is_repeated = np.all(np.diff(positions_m, axis=0) == 0.0, axis=1)
-    count, share = int(is_repeated.sum()), float(is_repeated.mean()) if len(is_repeated) else 0.0
-    if count < MIN_REPEATS or share < MIN_REPEAT_SHARE:
+    count, repeated_fraction = (
+        int(is_repeated.sum()),
+        float(is_repeated.mean()) if len(is_repeated) else 0.0,
+    )
+    if count < MIN_REPEATS or repeated_fraction < MIN_REPEAT_FRACTION:
         return
-    make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
+    make_finding = error if repeated_fraction >= MIN_REPEAT_FRACTION_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
         f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous "
-        f"position. KF and EKF2 use each repetition ({format_percent(share)}) as a new, "
-        "independent measurement.",
+        f"position ({format_percent(repeated_fraction)}). KF and EKF2 use each repetition as a new "
+        "measurement.",
         "Send each position once, with its time of measurement.",
-        {"count": count, "share": share},
+        {"count": count, "share": repeated_fraction},
     )
 
 
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect different position noise along north and east."""
     if analysis.source.origin.is_gnss:
-        return  # GNSS errors are mostly time-correlated; SIGMA_Z estimates only white noise
-    known_intervals = sorted(
+        return  # SIGMA_Z estimates only the white part of GNSS errors
+    noises_m = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
         if (noise := axis_tuning.sigma_z).value and noise.low and noise.high
     )
-    if len(known_intervals) < 2:
+    if len(noises_m) < 2:
         return
-    (small, _, small_high, quieter_axis), (large, large_low, _, noisier_axis) = known_intervals
-    if large < MIN_AXIS_RATIO * small or large_low <= small_high:
+    (smaller_m, _, smaller_high_m, quiet_axis), (larger_m, larger_low_m, _, noisy_axis) = noises_m
+    if larger_m < MIN_AXIS_RATIO * smaller_m or larger_low_m <= smaller_high_m:
         return
     yield warning(
         "source_noise_unequal_axes",
-        f"{capitalise_first(source_name(analysis.source))} noise is {large:.2g} m along "
-        f"{noisier_axis} and {small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 "
+        f"{source_name(analysis.source)} noise is {larger_m:.2g} m along "
+        f"{noisy_axis} and {smaller_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
         "measurement noise, does not fit both axes.",
         "Place the anchors on all sides of the flight area. Analyse each axis separately "
-        f"(--axis {noisier_axis} --sigma-z {large:.2g}).",
-        {f"{quieter_axis}_sigma_z_m": small, f"{noisier_axis}_sigma_z_m": large},
+        f"(--axis {noisy_axis} --sigma-z {larger_m:.2g}).",
+        {f"{quiet_axis}_sigma_z_m": smaller_m, f"{noisy_axis}_sigma_z_m": larger_m},
     )
 
 
 def detect_noise_variation(analysis: Analysis) -> Findings:
-    """Detect a time span of the flight in which most innovations are larger."""
-    part = analysis.noisy_part
-    if part is None or part.ratio < MIN_PART_RATIO:
+    noisy_part = analysis.noisy_part
+    if (
+        noisy_part is None
+        or noisy_part.ratio < MIN_PART_RATIO
+        # a fused outlier increases later innovations
+        or noisy_part.ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS
+    ):
         return
-    # a fused outlier increases later innovations: require a large ratio without outliers, too
-    if part.ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS:
-        return
-    ratio, start, end = part.ratio, part.start_s, part.end_s
-    check = "anchors in view, distance and obstacles"
+    ratio, start, end = noisy_part.ratio, noisy_part.start_s, noisy_part.end_s
+    items_to_check = "anchors in view, distance and obstacles"
     if analysis.source.origin.is_gnss:
-        check = "satellites in view, walls, trees and radio interference"
+        items_to_check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
         "source_noise_varies",
-        f"{capitalise_first(source_name(analysis.source))} noise is {ratio:.1f} times larger from "
+        f"{source_name(analysis.source)} noise is {ratio:.1f} times larger from "
         f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
         "No single SIGMA_Z fits the whole flight.",
-        f"Check {check} in that time. Let the source send a variance with each position, or "
-        "analyse this time separately (--start, --end).",
+        f"Check {items_to_check} in that time. Let the source send a variance with each position, "
+        "or analyse this time separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

@@ -1,9 +1,4 @@
-"""Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance.
-
-Six passes at 5 Hz with a position noise of 0.10 m determine the scale factor to 3.5 % (1 σ), so an
-error of 5 % is not detected. With 10 Hz and 0.05 m, 15 % is detected. Smaller errors need a
-measured distance or ground truth.
-"""
+"""Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -14,7 +9,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.core.arrays import Array
-from px4fuse.core.text import capitalise_first, format_factor, format_metres
+from px4fuse.core.text import format_factor, format_metres
 from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
@@ -47,53 +42,53 @@ from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
 MIN_MOTION_RANGE_M = 0.5
-# Extent of white noise in σ (5th to 95th percentile), with a margin of 25 %
+# The 5th to 95th percentile of white noise spans 3.29 σ; the margin is 25 %
 NOISE_RANGE_FACTOR = 1.25 * 3.29
 # Ratio of the median absolute second difference to the σ of white noise
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
-# Minimum gain of the log likelihood by a low pass: flights without a low pass have 0 to 2
+# Minimum gain of the log likelihood by a low pass over white noise: 0 to 2 without a low pass
 MIN_LOW_PASS_GAIN_NATS = 6.0
-# Minimum log likelihood of a low pass relative to time-correlated noise without lag
+# Minimum gain of the log likelihood by a low pass over time-correlated noise without lag
 MIN_LAG_NATS = 1.0
-# Minimum lag (s) of a low pass, for a warning: at 1 m/s half of the noise of good UWB (0.1 m)
+# Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum lag (s) of a low pass, for severity error: at 1 m/s the noise of good UWB (0.1 m)
+# Minimum lag (s) by a low pass, for severity error: a position error of 10 cm at 1 m/s
 MIN_LAG_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum jump in σ of the time-correlated noise, which changes by up to √2 σ
+# Minimum jump in σ of the time-correlated noise
 MIN_JUMP_SIGMAS = 5.0
-# Minimum number of announced jumps of a source that relocalises
+# Minimum number of jumps with an increment of reset_counter, for a source that relocalises
 MIN_RELOCALISATIONS = 2
 # Maximum time (s) from a jump to the reset of EKF2 that it causes
 MAX_WAIT_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
-# Tolerance (s) for equal times: timestamps have a resolution of 1 µs
+# Times within this tolerance (s) are equal: timestamps have a resolution of 1 µs
 RESET_TOLERANCE_S = 1e-4
-# EKF2_EV_CTRL of a source that measures the height only
+# Value of EKF2_EV_CTRL for a source that measures the height only
 HEIGHT_ONLY_CONTROL = 2
-# Maximum time (s) between a jump and its reset_counter: two intervals at 2 Hz
+# Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_RESET_DISTANCE_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
 MIN_JUMP_ERROR_M = 0.5
-# Minimum scale error (ratio minus 1) for a warning: correct simulated flights reach 0.11
+# Minimum scale error (ratio minus 1) for a warning: simulated flights without a fault reach 0.11
 MIN_SCALE = 0.12
 # Minimum scale error (ratio minus 1) for severity error: 1 m in 7 m
 MIN_SCALE_ERROR = 0.15
 # Minimum scale error in σ of its estimate: 0.3 % of correct sources exceed it
 MIN_SCALE_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
-MIN_OUTLIER_SHARE = 0.005
+MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
-MIN_OUTLIER_SHARE_ERROR = 0.02
+MIN_OUTLIER_FRACTION_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Minimum fraction of positions with logged innovation, to count rejected outliers
-MIN_INNOVATION_SHARE = 0.75
-# Minimum ratio of reported and estimated position variance, or its inverse, for a warning
+# Minimum fraction of positions with a logged innovation, for counting rejected outliers
+MIN_INNOVATION_FRACTION = 0.75
+# Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
-# Minimum ratio of reported and estimated position variance, or its inverse, for severity error
+# Minimum factor between reported and estimated position variance for severity error
 MIN_VARIANCE_RATIO_ERROR = 3.0
 # Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
@@ -106,7 +101,7 @@ JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
         "Do not change map or origin in flight.",
     ),
     "mocap": (
-        ("confused markers, or a change of the origin"),
+        "swapped markers, or a change of the origin",
         "Do not change origin or rigid body in flight.",
     ),
     "gnss": (
@@ -126,7 +121,7 @@ OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
         "Check light and texture in view of the camera, or remove outliers before sending.",
     ),
     "mocap": (
-        "hidden or confused markers",
+        "hidden or swapped markers",
         "Check the markers in view of the cameras, or remove outliers before sending.",
     ),
     "gnss": (
@@ -138,7 +133,6 @@ OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the positions."""
     if is_height_only(analysis.source):
         yield make_height_only_finding(analysis)
         return
@@ -155,12 +149,10 @@ def detect(analysis: Analysis) -> Findings:
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the position source, if it has one."""
     source, low_pass = analysis.source, analysis.source_low_pass
-    # drift of odometry also correlates successive errors; positions reconstructed from EKF2 are
-    # filtered
-    if source.orientation is not None or source.origin.reconstructed:
-        return None
     if (
-        not _is_clock_known(analysis)
+        source.orientation is not None  # drift of odometry also correlates successive errors
+        or source.origin.reconstructed
+        or not _is_clock_known(analysis)
         or not isinstance(low_pass, SourceLowPass)
         or low_pass.gain_nats < MIN_LOW_PASS_GAIN_NATS
         or low_pass.lag_s < MIN_LAG_S
@@ -174,18 +166,16 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
 
 
 def _is_clock_known(analysis: Analysis) -> bool:
-    """Return True if late timestamps cannot explain a lag of the positions."""
     return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_times(analysis))
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:
-    """Detect positions that are low-pass filtered."""
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
         make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
         yield make_finding(
             "source_low_pass_filtered",
-            f"{capitalise_first(positions_of(analysis.source))} are low-pass filtered and lag by "
+            f"{positions_of(analysis.source)} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
             f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
             "independent errors, so both are overconfident and lag.",
@@ -196,51 +186,50 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 
 
 def detect_jumps(analysis: Analysis) -> Findings:
-    """Detect position jumps that last and that the IMU does not measure."""
+    """Detect position jumps that the IMU does not measure."""
     fit = analysis.bias_scale_jump_fit
     # a change of the time offset also shifts the positions of a moving vehicle
     if not isinstance(fit, BiasScaleJumpFit) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
-    # time-correlated noise changes by about its σ within seconds, which resembles a jump
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
+        # time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
-    large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
+    large_jumps = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
     reset_s = reset_times_s(analysis.source)
-    if large:
-        largest = max(large, key=lambda jump: jump.size_m)
+    if large_jumps:
+        largest = max(large_jumps, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
-        positions = capitalise_first(positions_of(analysis.source))
+        positions = positions_of(analysis.source)
         causes, action = JUMP_CAUSES[analysis.source.origin.kind]
         cause = f"Possible causes: {causes}."
-        evidence = {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
+        evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
         if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
             cause = (
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
             )
-        extent = f"by {size_m:.2f} m"
-        steps_m = np.array([[step.value for step in jump.step_m] for jump in large])
+        jump_text = f"jump by {size_m:.2f} m"
+        steps_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
         end = "stay there"
         if np.linalg.norm(steps_m.sum(axis=0)) < MIN_JUMP_M:
             end = "return afterwards"
-        if len(large) > 1:
-            extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
+        if len(large_jumps) > 1:
+            jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} jump {extent} at {at_s:.1f} s and {end}. The IMU measures no such "
-            f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} After the jump the positions of KF "
-            "and EKF2 are wrong by its size, with consistent innovations.",
+            f"{positions} {jump_text} at {at_s:.1f} s and {end}. The IMU measures no such motion "
+            f"(± {1.96 * sigma:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and their "
+            "innovations stay consistent.",
             f"{action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
-            zero_length_spans(jump.time_s for jump in large),
+            zero_length_spans(jump.time_s for jump in large_jumps),
         )
 
 
 def make_height_only_finding(analysis: Analysis) -> Finding:
-    """Make the finding of a source with constant x and y."""
     source, log = analysis.source, analysis.flight.log
     x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
     parameter, action = EV_POS.switch, "Action: none, if the source measures only the height."
@@ -248,7 +237,7 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
         action = f"Leave {parameter} at {HEIGHT_ONLY_CONTROL} (height only): it is correct."
     return warning(
         "source_height_only",
-        f"x and y of {source.name} are constant ({x_m:g}, {y_m:g} m) in the whole flight. Only the "
+        f"The coordinates x and y of {source.name} are constant ({x_m:g}, {y_m:g} m). Only the "
         "height is a measurement. The horizontal position is not evaluated.",
         action,
         {"x_m": x_m, "y_m": y_m},
@@ -256,7 +245,7 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
 
 
 def detect_relocalisation(analysis: Analysis) -> Findings:
-    """Detect a source that drifts and jumps back, each time with a rise of its reset_counter."""
+    """Detect jumps of a source that corrects its drift (VIO, SLAM) and reports a reset."""
     source, segment, ekf2 = analysis.source, analysis.segment, analysis.flight.ekf2
     position_m = source.samples[Columns.POSITION[:2]].dropna()
     time_s, jumps = position_m.index.to_numpy(), []
@@ -292,9 +281,8 @@ def detect_relocalisation(analysis: Analysis) -> Findings:
     yield error(
         "source_relocalises",
         f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and its "
-        f"reset_counter rises at each jump. The jumps are at {listed} s, every "
-        f"{np.median(np.diff(times_s)):.0f} s: the source (VIO or SLAM) drifts and corrects its "
-        f"drift.{effect}",
+        f"reset_counter rises at each jump. The jumps are at {listed} s, about every "
+        f"{np.median(np.diff(times_s)):.0f} s: the source (VIO, SLAM) corrects its drift.{effect}",
         "Improve the tracking of the source (light, texture, calibration of the camera), or "
         "correct the drift in smaller steps. Analyse the time between two jumps (--start, --end).",
         {"count": len(jumps), "largest_m": float(sizes_m.max())},
@@ -307,23 +295,24 @@ def detect_scale_error(analysis: Analysis) -> Findings:
     imu, fit = analysis.flight.imu, analysis.bias_scale_jump_fit
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
-    # GNSS has no scale factor error, so a significant estimate has another cause
-    if analysis.source.origin.is_gnss:
-        return
-    # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
-    if not isinstance(fit, BiasScaleJumpFit) or find_low_pass(analysis) is not None:
-        return
-    if not isinstance(analysis.time_correlated_noise, Unavailable) or not _is_clock_known(analysis):
+    if (
+        analysis.source.origin.is_gnss  # GNSS has no scale factor error
+        or not isinstance(fit, BiasScaleJumpFit)
+        # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
+        or find_low_pass(analysis) is not None
+        or not isinstance(analysis.time_correlated_noise, Unavailable)
+        or not _is_clock_known(analysis)
+    ):
         return
     excess, sigma = fit.scale.value, fit.scale.sigma
     if abs(excess) >= max(MIN_SCALE, MIN_SCALE_SIGMAS * sigma):
         yield finding(
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
             "source_scale_error",
-            f"{capitalise_first(source_name(analysis.source))} distances are "
+            f"{source_name(analysis.source)} distances are "
             f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
-            f"comparison is with the IMU (± {format_percent(1.96 * sigma)}, 95 %). Innovations do "
-            "not show a scale factor error.",
+            f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
+            "Innovations do not show a scale factor error.",
             "Measure a known distance with the source. Then survey the anchors again, and check "
             "unit and calibration.",
             {"scale": 1.0 + excess, "sigma": sigma},
@@ -345,30 +334,32 @@ def detect_outliers(analysis: Analysis) -> Findings:
             for jump_s in jump_times_s
         )
     ]
-    count, share = len(times_s), len(times_s) / axis_tuning.count
-    if share < MIN_OUTLIER_SHARE or count < MIN_OUTLIERS:
+    count, outlier_fraction = len(times_s), len(times_s) / axis_tuning.count
+    if outlier_fraction < MIN_OUTLIER_FRACTION or count < MIN_OUTLIERS:
         return
     possible_cause, action = OUTLIER_CAUSES[analysis.source.origin.kind]
     sizes_m, reference = outlier_sizes_m(analysis, np.array(times_s))
     yield finding(
-        "error" if share >= MIN_OUTLIER_SHARE_ERROR else "warning",
+        "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
         "source_outliers",
         f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
-        f"{format_metres(float(sizes_m.max()))} m. The outliers ({format_percent(share, 1)}) have "
-        f"a median distance of {format_metres(float(np.median(sizes_m)))} m to {reference}. "
+        f"{format_metres(float(sizes_m.max()))} m ({format_percent(outlier_fraction, 1)}). Their "
+        f"median distance to {reference} is {format_metres(float(np.median(sizes_m)))} m. "
         f"Possible cause: {possible_cause}. KF has no gate and follows each "
         f"outlier.{_rejected(analysis, times_s)}",
         action,
-        {"count": count, "share": share, "first_s": times_s[0], "max_m": float(sizes_m.max())},
+        {
+            "count": count,
+            "share": outlier_fraction,
+            "first_s": times_s[0],
+            "max_m": float(sizes_m.max()),
+        },
         zero_length_spans(times_s),
     )
 
 
 def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
-    """Return the horizontal errors (m) of outliers, and the name of the reference.
-
-    The reference is ground truth, else the line between the positions before and after.
-    """
+    """Return the horizontal errors (m) of outliers, and the name of their reference."""
     axes = north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
     squares_m2 = np.zeros(len(outlier_time_s))
@@ -385,11 +376,10 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
 
 
 def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
-    """Format the number of outliers that EKF2 rejected, if the log shows it."""
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
-    if len(innovations) < MIN_INNOVATION_SHARE * len(analysis.main.axis.measurement_time_s):
+    if len(innovations) < MIN_INNOVATION_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.rate_hz
@@ -400,7 +390,6 @@ def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
 def detect_wrong_variance(analysis: Analysis) -> Findings:
     """Detect a reported variance that differs from the estimated position noise."""
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
-    # the noise of low-pass filtered positions is only part of their error
     may_be_low_passed = (
         isinstance(analysis.source_low_pass, Unavailable) or find_low_pass(analysis) is not None
     )
@@ -416,24 +405,24 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported_m = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_m / noise_m) ** 2
     ratio = max(variance_ratio, 1.0 / variance_ratio)
-    # R has to cover time-correlated errors, too, which innovations do not show
+    # R also has to include time-correlated errors, which innovations do not show
     error_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if error_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * error_m**2:
         return
     if ratio >= MIN_VARIANCE_RATIO and not low <= reported_m <= high:
-        direction, doubt = "small" if variance_ratio < 1.0 else "large", ""
+        direction, reservation = "small" if variance_ratio < 1.0 else "large", ""
         if direction == "large" and error_m is None:
-            doubt = " The reported σ may include time-correlated errors."
+            reservation = " The reported σ may include time-correlated errors."
         severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
-        use = "EKF2 uses the reported variance (EKF2_EV_NOISE_MD 0), but at least EKF2_EVP_NOISE²."
+        effect = "EKF2 uses this variance (EKF2_EV_NOISE_MD 0), but at least EKF2_EVP_NOISE²."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-            severity, use = "note", "EKF2 does not use the reported variance (EKF2_EV_NOISE_MD 1)."
+            severity, effect = "note", "EKF2 does not use this variance (EKF2_EV_NOISE_MD 1)."
         yield finding(
             severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
             f"{direction}. The reported σ is {reported_m:.3g} m, the position noise {noise_m:.3g} "
-            f"m (95 % {low:.3g} to {high:.3g} m). {use}{doubt}",
+            f"m (95 % {low:.3g} to {high:.3g} m). {effect}{reservation}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,
@@ -462,13 +451,11 @@ def motion_range_m(comparison: Comparison) -> float:
 
 
 def hardly_moved(comparison: Comparison) -> bool:
-    """Return True if the extent of the positions is small, or explained by noise.
-
-    The noise is estimated from second differences, which are zero at constant velocity.
-    """
+    """Return True if the extent of the positions is small, or not larger than their noise."""
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
+    # second differences are zero at constant velocity, so they show the noise
     second_difference_m = np.median(np.abs(np.diff(positions.to_numpy(), 2, axis=0)), axis=0)
     noise_m = float(second_difference_m.max()) / SECOND_DIFFERENCE_FACTOR
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)

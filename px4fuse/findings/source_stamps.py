@@ -1,4 +1,4 @@
-"""Position timestamps that are constant, or arrival times instead of measurement times."""
+"""Position timestamps that are constant, or that are arrival times instead of measurement times."""
 
 import numpy as np
 import pandas as pd
@@ -11,21 +11,18 @@ from px4fuse.findings.model import Findings, error, fraction_on, note, warning
 from px4fuse.flight.log import SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
 
-# Maximum jitter (s) of receive times without a finding: at 1 m/s a tenth of the noise of good UWB
-# (0.1 m)
+# Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
 # Maximum age (s) of a position whose timestamp is its arrival time: PX4 publishes it within 1 ms
 MAX_ARRIVAL_AGE_S = 0.001
-# Minimum latency (s) for a warning: at 1 m/s a fifth of the noise of good UWB (0.1 m)
+# Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
-# Minimum latency (s) for severity error: at 1 m/s the noise of good UWB (0.1 m)
+# Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum number of positions with arrival times, and with measurement times, to find a
-# synchronisation
+# Minimum number of positions before, and after, the time at which TIMESYNC converged
 MIN_SAMPLES = 10
-# Minimum fraction of positions with the same kind of timestamp (arrival, measurement): a few are
-# late
-MIN_CONSISTENT_SHARE = 0.95
+# Minimum fraction of arrival times before, and of measurement times after, that time
+MIN_CONSISTENT_FRACTION = 0.95
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -33,7 +30,6 @@ ANSWER_TIMESYNC = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect timestamps that are not the time of measurement."""
     clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
@@ -59,7 +55,6 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:
-    """Make the finding of several positions with the same timestamp."""
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = count / (distinct_count * resolution_s)
     yield error(
@@ -76,10 +71,10 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     effect = ""
     if isinstance(fusing, pd.DataFrame) and not fraction_on(fusing["horizontal"], segment):
-        effect = f"EKF2 never fused the positions: for EKF2 they are {STAMP_FAULTS[clock]}. "
+        effect = f"EKF2 never fused the positions: it reads them as {STAMP_FAULTS[clock]}. "
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(
         "source_timestamp_unit",
@@ -93,7 +88,6 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
 
 
 def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
-    """Make the findings of constant timestamps and of jitter in the receive times."""
     yield error(
         "source_timestamps_constant",
         f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
@@ -128,7 +122,8 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
     if synchronisation is not None:
         until_s, latency_s = synchronisation
         make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
-        if _is_on_ground_until(analysis, until_s):
+        airborne = analysis.flight.airborne
+        if not isinstance(airborne, Unavailable) and all(start >= until_s for start, _ in airborne):
             make_finding = note
         yield make_finding(
             "source_timestamps_are_arrival_times",
@@ -141,7 +136,7 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             {"until_s": until_s, "latency_s": latency_s},
             ((float(age.index[0]), until_s),),
         )
-    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_SHARE:
+    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_FRACTION:
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
@@ -152,32 +147,22 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         )
 
 
-def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
-    airborne = analysis.flight.airborne
-    return not isinstance(airborne, Unavailable) and all(start >= time_s for start, _ in airborne)
-
-
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
-    """Find the time (s) at which TIMESYNC converged, and the latency (s) of the positions.
-
-    Before this time the timestamps are arrival times. Return None without such a change.
-    """
+    """Find the time (s) at which TIMESYNC converged in flight, and the position latency (s)."""
     age = _age_s(analysis)
     if age is None:
         return None
     is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # for each position: number of timestamps of the wrong kind, if TIMESYNC converged just after it
+    # number of contradicting timestamps, if TIMESYNC converged after this position
     wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
-    cut = int(np.argmin(wrong_count)) + 1
-    if np.mean(is_arrival) >= MIN_CONSISTENT_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
+    index = int(np.argmin(wrong_count)) + 1
+    if np.mean(is_arrival) >= MIN_CONSISTENT_FRACTION or min(index, len(age) - index) < MIN_SAMPLES:
         return None
-    latency_s = float(age.iloc[cut:].median())
-    is_consistent = (
-        min(np.mean(is_arrival[:cut]), np.mean(~is_arrival[cut:])) >= MIN_CONSISTENT_SHARE
-    )
-    return (
-        (float(age.index[cut]), latency_s) if is_consistent and latency_s >= MIN_LATENCY_S else None
-    )
+    latency_s = float(age.iloc[index:].median())
+    consistent_fraction = min(np.mean(is_arrival[:index]), np.mean(~is_arrival[index:]))
+    if consistent_fraction < MIN_CONSISTENT_FRACTION or latency_s < MIN_LATENCY_S:
+        return None
+    return float(age.index[index]), latency_s
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:

@@ -1,4 +1,4 @@
-"""Values of the source that are not measurements: zeros, held, rounded, mixed or copied."""
+"""Positions that are not measurements: zeros, repeated, rounded, alternating or copied values."""
 
 from collections.abc import Mapping
 
@@ -12,7 +12,7 @@ from px4fuse.comparison.remedy import aid_of, format_settings, is_fused_source
 from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import cut_to_segment
@@ -20,30 +20,26 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_of, source_name
 
-# Minimum rounding step (m) for a finding: smaller steps cause an error (0.29 steps, 1 σ) below the
-# noise of UWB
+# Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_STEP_M = 0.05
-# Minimum distance (m) between the positions of two alternating systems for a finding: the noise of
-# good UWB
+# Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
 MIN_OFFSET_M = 0.1
-# Minimum distance between the positions of two systems, in σ of its estimate: white noise of one
-# system reaches 2
+# Minimum distance between the positions of two senders, in σ: white noise of one sender reaches 2
 MIN_OFFSET_SIGMAS = 4.0
-# Number of samples in a window in which two systems alternate; a lost sample reverses their order
+# Number of samples in a window for detecting two senders: short, because a lost sample swaps them
 WINDOW = 16
-# Minimum number of windows in which two systems alternate: with fewer, outliers of one system
-# resemble two systems
+# Minimum number of windows: with fewer windows, outliers of one sender resemble two senders
 MIN_WINDOWS = 10
-# Maximum median distance (m) from EKF2's position of a copy that EKF2 does not fuse
+# Maximum median distance (m) from EKF2's position to a copy of it
 MAX_COPY_M = 0.01
-# Maximum median distance (m) from EKF2's position of a copy that EKF2 fuses, and so follows
+# Maximum median distance (m) from EKF2's position to a copy of it that EKF2 fuses
 MAX_FOLLOWED_COPY_M = 0.001
 # Minimum speed (m/s) for the comparison with EKF2: at rest any source may equal EKF2's position
 MIN_COPY_SPEED_M_S = 0.2
 # Tested times (s) between EKF2's position and the timestamp of its copy
 DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES = "px4fuse estimates nothing from these positions."
-# Id of the finding, fault and action, by the reason why a row contains no measurement
+# Id of the finding, fault and action for each kind of invalid position
 INVALID: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
@@ -64,7 +60,6 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect values that are no measurement of the vehicle's position."""
     yield from detect_invalid_rows(analysis)
     yield from detect_rounding(analysis)
     yield from detect_lever_arm(analysis)
@@ -73,7 +68,6 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    """Return the time spans of rows without a valid sample between them."""
     # rows of one span have the same valid sample before them
     before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(before, prepend=-1))
@@ -82,7 +76,6 @@ def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
 
 
 def detect_invalid_rows(analysis: Analysis) -> Findings:
-    """Detect rows that contain zeros, a repeated last position, or no position."""
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
     for reason, (name, fault_template, action) in INVALID.items():
@@ -122,7 +115,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     source, step_m = analysis.source, analysis.source.step_m
     if step_m < MIN_STEP_M:
         return
-    cause, action = "The source rounds them.", "Send the positions with more digits."
+    cause, action = "The source rounds the positions.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
         cause = "A 32-bit float has this resolution at large coordinates, such as UTM."
         action = (
@@ -131,7 +124,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
         )
     yield warning(
         "source_positions_rounded",
-        f"{capitalise_first(positions_of(source))} move in steps of {step_m:.3g} m. {cause} The "
+        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The "
         f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. "
         f"{NO_ESTIMATES}",
         action,
@@ -146,11 +139,13 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     is_determined = convention is not None and convention.verdict == "determined"
     if not source.origin.has_all_samples or not (has_truth or is_determined):
         return
-    arm = estimate_lever_arm(analysis.flight, source)
-    if arm is None:
+    lever_arm = estimate_lever_arm(analysis.flight, source)
+    if lever_arm is None:
         return
-    forward_m, right_m, sigma_m = arm
-    values = [known + excess for known, excess in zip(source.lever_arm_m, arm[:2], strict=False)]
+    forward_m, right_m, sigma_m = lever_arm
+    values = [
+        known + excess for known, excess in zip(source.lever_arm_m, lever_arm[:2], strict=False)
+    ]
     parameters = aid_of(analysis).lever_arm
     change = {name: round(value, 2) for name, value in zip(parameters, values, strict=False)}
     sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
@@ -188,7 +183,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str:
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
-    """Detect two systems whose positions alternate."""
+    """Detect two senders whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
     count, rate_hz = (len(samples) - 2) // WINDOW, analysis.source.rate_hz
@@ -233,7 +228,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     differences = [_difference_m(position_m, time_s - d, state) for d in DELAYS_S]
     best = int(np.nanargmin(differences)) if np.isfinite(differences).any() else 0
-    fusing = ekf2.fusing
+    fusing = ekf2.fusion_flags
     is_fused = isinstance(fusing, Unavailable) or bool(
         (fusing["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
     )
@@ -245,8 +240,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     quantity = "position and attitude" if is_copied else "position"
     yield error(
         "source_is_ekf2_estimate",
-        f"{source_name(source)} sends EKF2's own {quantity} back. The positions equal EKF2's of "
-        f"{1e3 * DELAYS_S[best]:.0f} ms earlier (median difference "
+        f"{source_name(source)} sends EKF2's own {quantity} back. The positions equal EKF2's "
+        f"position {1e3 * DELAYS_S[best]:.0f} ms earlier (median difference "
         f"{1e3 * differences[best]:.1f} mm). They contain no measurement: EKF2's σ decreases, "
         "its error does not.",
         "Send the position of the positioning system. Do not connect the autopilot's local "

@@ -333,8 +333,8 @@ class AidLog:
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at times; before its start, the first value."""
-    rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    return np.asarray(steps, dtype=np.float64)[rows]
+    previous_rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    return np.asarray(steps, dtype=np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
@@ -360,7 +360,7 @@ class Ekf2:
     innovation_topics: tuple[str, ...]
     # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
     # ``yaw``
-    fusing: TableOrUnavailable
+    fusion_flags: TableOrUnavailable
     resets: tuple[Reset, ...]
     # (Start time, primary instance from then on)
     instances: tuple[tuple[float, int], ...]

@@ -1,8 +1,4 @@
-"""Web page with one table that the page's script sorts, searches, filters and unfolds.
-
-Rows are JSON; the script draws a hundred at a time, so thousands of rows remain fast. Without
-scripts the page shows its first rows as a plain table.
-"""
+"""Web page with one table that users can sort, search, filter and unfold."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,14 +17,13 @@ class Column:
 
     Attributes
     ----------
-    kind : {"text", "name", "full", "line", "number", "rank", "ratio"}
-        Sort order; "name" is the text that unfolds the row (default: the first column), "full" is
-        text that is never cut, "line" is text without line breaks, "rank" is text sorted by a
-        number, and "ratio" is a number on the axis of the page.
+    kind : str
+        "name": click to unfold the row; "full": text that is never cut; "line": text on one line;
+        "rank": text sorted by a number; "ratio": number drawn on an axis.
     group : str
-        Group whose check box shows the column; "": the column is always shown.
-    visible_from : {"always", "tablet", "desk"}
-        Smallest screen on which the column is visible.
+        Check box that shows the column; "" for a column that is always shown.
+    visible_from : str
+        Smallest screen with this column.
     """
 
     title: str
@@ -39,17 +34,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """Cell of a row.
-
-    Attributes
-    ----------
-    value : float, str or None
-        Sort key; None is sorted last in both directions.
-    below : str
-        Second line in small print.
-    style_class : str
-        "" for text, "flags" for one flag per line, else the CSS class of a label.
-    """
+    """Cell of a row, with its sort key ``value`` and a second line ``below``."""
 
     text: str = ""
     value: float | str | None = None
@@ -58,7 +43,6 @@ class Cell:
 
 
 def text_cell(text: str, text_below: str = "") -> Cell:
-    """Return a cell sorted by its text."""
     return Cell(text, text or None, text_below)
 
 
@@ -74,17 +58,9 @@ Section = list[Any]
 
 @dataclass(frozen=True)
 class Row:
-    """Row of the table.
+    """Row of the table; filters select rows by ``tags``.
 
-    Attributes
-    ----------
-    cells : tuple of Cell
-        One per column; the first one names the row and unfolds it.
-    tags : tuple of str
-        Values that the filters select.
-    details, side_sections : tuple of Section
-        Left and right column of the unfolded row, made by :func:`list_section` and the other
-        functions below; empty sections are omitted.
+    The unfolded row shows ``details`` at the left and ``side_sections`` at the right.
     """
 
     cells: tuple[Cell, ...]
@@ -97,12 +73,11 @@ class Row:
 
 
 def list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> Section:
-    """Return a section with a list of texts, highlighted if `is_warning`."""
     return ["list", title, texts, is_warning]
 
 
 def prose_section(title: str, text: str) -> Section:
-    """Return a section with text that keeps its line breaks."""
+    """Return a section with a text that keeps its line breaks."""
     return ["prose", title, text]
 
 
@@ -117,12 +92,10 @@ def table_section(
     rows: Sequence[Sequence[str]],
     numeric_columns: Sequence[int] = (),
 ) -> Section:
-    """Return a section with a small table; ``numeric_columns`` are right-aligned."""
     return ["table", title, heads, rows, list(numeric_columns)]
 
 
 def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
-    """Return a section with link texts and relative addresses."""
     return ["links", title, [row for row in rows if row[1]]]
 
 
@@ -134,13 +107,7 @@ def boxes_section(
 ) -> Section:
     """Return a section with input boxes for points and comments, exported as CSV.
 
-    Parameters
-    ----------
-    person_id : str
-        Id of the person in the exported table.
-    rows : sequence of (name, maximum, points, comment)
-    other_rows : sequence of (name, points, comment)
-        Further rows of the exported table, without boxes.
+    ``rows`` are (name, maximum, points, comment); ``other_rows`` are exported without boxes.
     """
     return ["boxes", title, person_id, rows, other_rows]
 
@@ -153,7 +120,7 @@ def page(
     title: str,
     subtitle: str,
     html_above: str = "",
-    noun: tuple[str, str],
+    row_nouns: tuple[str, str],
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
@@ -166,26 +133,17 @@ def page(
 
     Parameters
     ----------
-    html_above : str
-        HTML above the table, made with :func:`~px4fuse.html.safe.load_template`.
-    noun : (str, str)
+    row_nouns : (str, str)
         Name of a row, singular and plural.
     filters : sequence of (label, ((tag, text), ...))
-        A selected tag limits the table to rows with it.
     groups : sequence of (group, label)
         Check boxes for groups of columns.
     placeholder : str
         Hint in the search field.
     full_table_note : str
-        Sentence for readers without scripts: the file with all rows.
+        Sentence on the file with all rows, for browsers without scripts.
     ratio_axis : mapping, optional
-        Scale of the plots in columns of ratios: ``ends``, ``bands`` and ``marks`` (SVG paths).
-        The second word of the style class of a cell is a key of ``bands`` and ``marks``.
-
-    Returns
-    -------
-    str
-        HTML, identical for the same input; write it as UTF-8.
+        Axis of the ratio columns: ``ends``, ``bands`` and ``marks`` (SVG paths).
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
@@ -203,7 +161,7 @@ def page(
             for row in rows
         ],
         "size": MAX_PAGE_ROWS,
-        "nouns": noun,
+        "nouns": row_nouns,
         "axis": ratio_axis or {},
     }
     return load_template("html/frame.html").render(
@@ -217,7 +175,7 @@ def page(
         placeholder=placeholder,
         filters=filters,
         groups=groups,
-        noun=noun,
+        row_nouns=row_nouns,
         columns=columns,
         rows=rows,
         plain_rows=MAX_PLAIN_ROWS,
@@ -227,10 +185,7 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a table cell without empty fields at the end.
-
-    A value that equals the text of the cell is replaced by True.
-    """
+    # short fields keep the page small: True is a value equal to the text
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     fields = [cell.text, value, cell.below, cell.style_class]
     while fields and fields[-1] == "":

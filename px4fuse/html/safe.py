@@ -20,10 +20,10 @@ HARMFUL_CHARACTERS = re.compile(
 )
 
 
-def clean(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
+def clean_text(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
     r"""Replace characters that could change the display of other text, and shorten the text.
 
-    >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
+    >>> clean_text("a\x1b\u202eb", 10), clean_text("abcdef", 3)
     ('a��b', 'abc…')
     """
     text = text if len(text) <= max_length else text[:max_length] + "…"
@@ -31,12 +31,11 @@ def clean(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
 
 
 def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
-    """Clean all texts in nested data, and convert numpy numbers to Python numbers."""
     if isinstance(value, str):
-        return clean(value, max_length)
+        return clean_text(value, max_length)
     if isinstance(value, dict):
         return {
-            clean(str(name), max_length): clean_values(element, max_length)
+            clean_text(str(name), max_length): clean_values(element, max_length)
             for name, element in value.items()
         }
     if isinstance(value, list | tuple):
@@ -70,12 +69,12 @@ def local_link(path: str) -> str:
 
 @cache
 def load_template(name: str) -> Template:
-    """Load a template of the package that cleans and escapes all inserted text."""
+    """Load a template that cleans and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,
         trim_blocks=True,
-        finalize=lambda value: clean(value) if type(value) is str else value,
+        finalize=lambda value: clean_text(value) if type(value) is str else value,
         undefined=StrictUndefined,
     )
     return environment.get_template(name)

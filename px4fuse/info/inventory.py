@@ -213,7 +213,7 @@ def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavai
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
         data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusing}
+        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
     return {**data_by_part, "truth": samples, "airborne": flight.airborne}
 

@@ -76,7 +76,7 @@ def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
     ekf2 = flight.ekf2
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
-        sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
+        sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusion_flags]
     sections += [imu_and_attitude(flight), flight.airborne, flight.truth]
     unavailable = [section for section in sections if isinstance(section, Unavailable)]
     if not flight.positions:
@@ -209,7 +209,7 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     if axis_tables:
         innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
         yield from _stream_table(flight, "ekf2_innovations", innovation_table)
-    yield from _stream_table(flight, "ekf2_fusing", ekf2.fusing)
+    yield from _stream_table(flight, "ekf2_fusing", ekf2.fusion_flags)
     topics_and_clock = _topics_and_clock(flight, "ekf2_state")
     delta_rows = [reset.delta for reset in ekf2.resets]
     resets = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)

@@ -93,8 +93,8 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
     frame_indices = [0]
     last_frame_m = position_m[0]
     for index, position in enumerate(position_m[1:-1], start=1):
-        step = position - last_frame_m
-        if step @ step >= spacing_m * spacing_m:
+        displacement_m = position - last_frame_m
+        if displacement_m @ displacement_m >= spacing_m * spacing_m:
             frame_indices.append(index)
             last_frame_m = position
     if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
@@ -129,8 +129,8 @@ def distribute_by_distance(
     -----
     Bowditch (1808); UAT 366 module 2, Example 2.
     """
-    cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
-    return np.asarray(position_m - (cumulative / cumulative[-1])[:, None] * misclosure_m)
+    distance_m = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
+    return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:

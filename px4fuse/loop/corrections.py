@@ -176,11 +176,11 @@ def score_paths(
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
     """Compute ATE and RPE of the odometry, and of corrected paths with the same time offset."""
-    offsets: dict[str, float] = {}
+    offset_by_reference: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
         same_clock = 0.0 if reference.sha256 == path.sha256 else None
-        offset_s = offsets.get(reference.name, same_clock)
+        offset_s = offset_by_reference.get(reference.name, same_clock)
         try:
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
@@ -195,7 +195,9 @@ def score_paths(
     ) -> CorrectedPath:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
         names = ("cost_initial", "cost", "iterations", "converged")
-        costs = {} if solution is None else {name: getattr(solution, name) for name in names}
+        solution_fields = (
+            {} if solution is None else {name: getattr(solution, name) for name in names}
+        )
         return CorrectedPath(
             name=CORRECTION_LABELS[name],
             trajectory=path,
@@ -203,13 +205,13 @@ def score_paths(
             correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
             scores={reference.name: score(path, reference) for reference in references},
             solution=solution,
-            **costs,
+            **solution_fields,
         )
 
     uncorrected = score_path("uncorrected", odometry, None)
     for name, evaluation in uncorrected.scores.items():
         if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
-            offsets[name] = evaluation.time_offset.offset_s
+            offset_by_reference[name] = evaluation.time_offset.offset_s
     scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
     for name, corrected_path in corrected_paths.items():
         all_closures_path = scored_paths.get("pose_graph_all")

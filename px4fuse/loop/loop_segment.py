@@ -48,16 +48,16 @@ def cut_trajectory(
     position = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
-        resting = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
+        poses_at_rest = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
         # If the vehicle is not at rest, the single pose at this end of the segment is used
         if (
-            not len(resting)
-            or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > MAX_REST_RANGE_M
+            not len(poses_at_rest)
+            or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0)) > MAX_REST_RANGE_M
         ):
             continue
-        position[index] = resting.position_m.mean(axis=0)
-        if quaternions is not None and resting.rotation is not None:
-            quaternions[index] = resting.rotation.mean().as_quat()
+        position[index] = poses_at_rest.position_m.mean(axis=0)
+        if quaternions is not None and poses_at_rest.rotation is not None:
+            quaternions[index] = poses_at_rest.rotation.mean().as_quat()
     rotation = None if quaternions is None else Rotation.from_quat(quaternions)
     return replace(segment_track, position_m=position, rotation=rotation)
 

@@ -32,7 +32,7 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     """Return the descriptions of all missing data of a flight, also inside :class:`Ekf2`."""
     for data in flight_data:
         if isinstance(data, Ekf2):
-            flight_data += (data.variance, *data.innovations.values(), data.fusing)
+            flight_data += (data.variance, *data.innovations.values(), data.fusion_flags)
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
@@ -75,21 +75,21 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
     is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
     reason[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    others, zeros = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
-    if len(others):
-        after = np.searchsorted(others, zeros)
-        beside = others[np.clip([after - 1, after], 0, len(others) - 1)]
-        distance_m = np.linalg.norm(values[beside], axis=2).min(axis=0)
-        reason.iloc[zeros[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+    measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
+    if len(measured_rows):
+        next_index = np.searchsorted(measured_rows, zero_rows)
+        neighbours = measured_rows[np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)]
+        distance_m = np.linalg.norm(values[neighbours], axis=2).min(axis=0)
+        reason.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
     valid = np.flatnonzero(reason == "")
     is_same = np.all(np.diff(values[valid], axis=0) == 0.0, axis=1)
     starts = np.flatnonzero(np.append(True, ~is_same))
-    held = [
+    held_rows = [
         valid[start + 1 : end]
         for start, end in zip(starts, [*starts[1:], len(valid)], strict=True)
         if end - start >= MIN_HELD_COUNT and np.ptp(time_s[valid[start:end]]) >= MIN_HELD_S
     ]
-    if held and len(rows := np.concatenate(held)) < MAX_HELD_FRACTION * len(valid):
+    if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid):
         reason.iloc[rows] = "held"
     return reason
 

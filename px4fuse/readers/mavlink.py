@@ -221,7 +221,7 @@ def _read_ekf2(
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=Unavailable(
+        fusion_flags=Unavailable(
             "EKF2 fusion flags",
             "MAVLink does not transmit EKF2 fusion flags",
             remedies["innovations"],

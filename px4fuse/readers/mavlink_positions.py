@@ -129,11 +129,11 @@ def _read_gnss(
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
-        few = "none" if fixes.empty else f"only {len(fixes)}"
+        fix_count = "none" if fixes.empty else f"only {len(fixes)}"
         return (
             px4_positions.unavailable(
                 layout.topic,
-                f"{count} messages, {few} with a 3D fix",
+                f"{count} messages, {fix_count} with a 3D fix",
                 "Give the antenna a free view of the sky and wait for a fix.",
             )
             if count

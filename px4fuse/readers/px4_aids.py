@@ -58,7 +58,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     logs.
     """
     enabled_aids = {}
-    tables = topics.of(px4.STATUS_FLAGS)
+    tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *DISTURBANCES.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
@@ -108,7 +108,7 @@ def _read_common_topics(
     topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 ) -> AidLog | None:
     is_in_gauss = aid.name == "mag_heading" and any(
-        "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
+        "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
     layouts = []
     if aid.fields and not is_in_gauss:

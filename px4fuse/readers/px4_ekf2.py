@@ -101,7 +101,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         f"the times of EKF2 innovations are publication times, up to 0.2 s late, because {topic} "
         "has no measurement time"
         for topic in innovation_topics[:1]
-        if not any("timestamp_sample" in table for table in topics.of(topic))
+        if not any("timestamp_sample" in table for table in topics.tables_of(topic))
     ]
     notes += [
         f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
@@ -128,9 +128,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         variance=variance,
         innovations=innovations,
         innovation_topics=innovation_topics,
-        fusing=fusion_flags,
+        fusion_flags=fusion_flags,
         resets=read_resets(local_position),
-        instances=topics.primary,
+        instances=topics.primary_instances,
         gate=gate,
         notes=tuple(notes),
         accelerometer_bias=_accelerometer_bias(topics, delayed_state),
@@ -151,7 +151,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
     unknown.
     """
     for topic in px4.ESTIMATOR_STATES:
-        for table in topics.of(topic)[:1]:
+        for table in topics.tables_of(topic)[:1]:
             states = sum(name.startswith("states[") for name in table)
             variances = sum(name.startswith("covariances[") for name in table)
             if variances:
@@ -262,7 +262,7 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
 
 def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
-    for table in topics.of(topic)[:1]:
+    for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
             times = time_index((measured_us - topics.zero_us) * 1e-6)

@@ -82,7 +82,11 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     gate = parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
-        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusion_flags, gate=gate
+        ekf2,
+        innovations=innovations,
+        innovation_topics=topics,
+        fusion_flags=fusion_flags,
+        gate=gate,
     )
 
 

@@ -67,7 +67,7 @@ def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read all external position tracks, best first, and the reasons for missing tracks."""
-    fusion_flags = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
     turns = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
@@ -199,7 +199,7 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
     uses the arrival time if ``timestamp_sample`` is not boot time in microseconds.
     """
-    table = topics.of(topic)[0]
+    table = topics.tables_of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
         return None
     published_us = table["timestamp"].astype(np.int64)

@@ -147,32 +147,32 @@ def find_table(
         text += f"{last_line}\n"
     elif last_line.strip():
         notes.append("the last line of the position file was dropped, because it has no line end")
-    found = None if columns else _find_json(file_name, text)
+    table = None if columns else _find_json(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
-    if columns is None and found is None:
-        found = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
+    if columns is None and table is None:
+        table = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
-    if found is None:
-        found = _find_header(file_name, text, lines, wanted_names)
-    if found is None and not wanted_names:
-        found = _find_numbers(path, text, lines)
-    if found is None:
+    if table is None:
+        table = _find_header(file_name, text, lines, wanted_names)
+    if table is None and not wanted_names:
+        table = _find_numbers(path, text, lines)
+    if table is None:
         title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{title_list}. The first line is {quote(lines[0])}.",
             f"Add a header such as time,x,y,z, or name the columns with {COLUMNS_OPTION}.",
         )
-    first_row = found.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
-    row_width = len(_split_line(first_row.rstrip(f"{found.separator} "), found.separator))
-    if row_width > len(found.names):
+    first_row = table.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+    row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
+    if row_width > len(table.names):
         raise LogError(
-            f"{file_name}: the header has {len(found.names)} columns, but the rows have "
+            f"{file_name}: the header has {len(table.names)} columns, but the rows have "
             f"{row_width}.",
             "Write numbers with decimal points, and give each column a name.",
         )
-    return replace(found, notes=(*found.notes, *notes))
+    return replace(table, notes=(*table.notes, *notes))
 
 
 def _is_complete(line: str, line_before: str) -> bool:
@@ -223,23 +223,27 @@ def _find_groups(
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         row_by_title = {row[1]: row for row in rows[2:header]}
-        owners, kinds = (row_by_title.get(title, axes) for title in ("Name", "Type"))
-        used_kinds = {"Rigid Body"} if "Rigid Body" in kinds else {*kinds}
+        body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
+        used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
         # Rotations are not read, because the axes of a rigid body are not those of the vehicle
         names = [
-            f"{axis}_{unit}" if group == "Position" and kind in used_kinds else ""
-            for axis, group, kind in zip(axes, rows[header - 1], kinds, strict=False)
+            f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
+            for axis, group, body_type in zip(axes, rows[header - 1], body_types, strict=False)
         ]
     else:
-        owners = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
+        body_names = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
         names = [
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
             for axis, unit in zip(axes, rows[header + 1], strict=False)
         ]
         body = re.split(r"\n[, ]*\n", body.partition("\n")[2], maxsplit=1)[0] + "\n"
-    owners_with_position = (owner for owner, name in zip(owners, names, strict=False) if name)
-    chosen = choose_body(file_name, owners_with_position, wanted_body)
-    names = [name * (owner == chosen) for owner, name in zip(owners, names, strict=False)]
+    bodies_with_position = (
+        body_name for body_name, name in zip(body_names, names, strict=False) if name
+    )
+    chosen = choose_body(file_name, bodies_with_position, wanted_body)
+    names = [
+        name * (body_name == chosen) for body_name, name in zip(body_names, names, strict=False)
+    ]
     names[:2] = axes[:2] if is_motive else ["time", ""]
     return Table(
         file_name,

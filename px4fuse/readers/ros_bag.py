@@ -116,16 +116,18 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
 
 
 def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
-    type_by_topic = {one.topic: one.msgtype for one in reader.connections}
-    usable = [one for one, kind in type_by_topic.items() if kind in _TYPES]
-    chosen = usable[0] if topic is None and len(usable) == 1 else topic
-    if chosen not in usable:
+    type_by_topic = {connection.topic: connection.msgtype for connection in reader.connections}
+    usable_topics = [topic_name for topic_name, kind in type_by_topic.items() if kind in _TYPES]
+    chosen_topic = usable_topics[0] if topic is None and len(usable_topics) == 1 else topic
+    if chosen_topic not in usable_topics:
         raise LogError(
-            f"{name} contains these topics with positions: {', '.join(usable) or 'none'}",
-            f"Give {name}:TOPIC." if usable else "Record the positions as PoseStamped.",
+            f"{name} contains these topics with positions: {', '.join(usable_topics) or 'none'}",
+            f"Give {name}:TOPIC." if usable_topics else "Record the positions as PoseStamped.",
         )
-    kind = type_by_topic[chosen]
-    messages = reader.messages([one for one in reader.connections if one.topic == chosen])
+    kind = type_by_topic[chosen_topic]
+    messages = reader.messages(
+        [connection for connection in reader.connections if connection.topic == chosen_topic]
+    )
     if kind == _PATH:
         messages = deque(messages, maxlen=1)  # each path repeats the poses of the previous one
     lags_s, rows, frames = [], [], set()
@@ -136,11 +138,11 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
             frames.add(getattr(stamped, "pose_frame", None))
             lags_s.append((receive_ns - time_ns) * 1e-9)
             rows.append(f"{time_ns},{str(_values(stamped))[1:-1]}\n")
-    notes = [f"the topic is {chosen} ({kind})"]
+    notes = [f"the topic is {chosen_topic} ({kind})"]
     if rows:
-        low, middle, high = np.percentile(lags_s, [2.5, 50.0, 97.5])
+        low, median, high = np.percentile(lags_s, [2.5, 50.0, 97.5])
         notes.append(
-            f"the timestamps in the messages are used; they were received {middle:.3f} s later "
+            f"the timestamps in the messages are used; they were received {median:.3f} s later "
             f"(95 % {low:.3f} to {high:.3f} s)"
         )
     return Table(

@@ -79,7 +79,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED_TOPICS.items()
-            for table in topics.of(name)[:1]
+            for table in topics.tables_of(name)[:1]
         ),
     )
 

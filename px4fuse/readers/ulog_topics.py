@@ -196,12 +196,12 @@ class Topics:
         """Return the sorted instance numbers of a topic with data."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def of(self, topic: str) -> list[Table]:
+    def tables_of(self, topic: str) -> list[Table]:
         """Return the tables of all instances of a topic, in order of the instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
-    def primary(self) -> Instances:
+    def primary_instances(self) -> Instances:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
@@ -216,7 +216,9 @@ class Topics:
     def find(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are all in the log, if any."""
         for layout in layouts:
-            if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
+            if any(
+                {*layout.columns.values()} <= table.keys() for table in self.tables_of(layout.topic)
+            ):
                 return layout
         return None
 
@@ -294,8 +296,10 @@ class Topics:
         if self.find(layout) is None:
             return _empty_frame(layout)
         available = self.instances(layout.topic)
-        is_single = self.primary == NO_SELECTOR
-        switch_s, numbers = (np.array(values) for values in zip(*self.primary, strict=True))
+        is_single = self.primary_instances == NO_SELECTOR
+        switch_s, numbers = (
+            np.array(values) for values in zip(*self.primary_instances, strict=True)
+        )
         primary_frames: list[pd.DataFrame] = []
         for number in available[:1] if is_single else available:
             samples = self.read_instance(layout, number, step=step)
@@ -312,7 +316,7 @@ class Topics:
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
-            for table in self.of(topics[0])
+            for table in self.tables_of(topics[0])
         )
         event = "measurement" if has_measurement_time else "publication"
         self.streams[data_kind] = Stream(

@@ -23,30 +23,24 @@ LEAD_TEXT = (
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
 MAX_NORMALISED = 4.0  # maximum ν/√S of the plots; larger values are drawn as triangles
-# Aiding sources of which EKF2 must fuse at least one for this page in the report of a comparison
+# The report of a comparison has this page if EKF2 fused one of these aiding sources
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS or optical flow."""
-    page = Page(appendix_title(TITLE), LEAD_TEXT)
-    aid_results = write_aids_of_comparison(page, analysis)
-    if aid_results:
+    if aid_results := outdoor_aids(analysis):
+        page = Page(appendix_title(TITLE), LEAD_TEXT)
+        write_aids(page, aid_results)
         _draw_aid_panels(page, analysis.flight, aid_results)
         yield page
 
 
-def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write and return the aiding sources; {} if EKF2 fused neither GNSS nor optical flow."""
-    aid_results = analysis.aids
-    if isinstance(aid_results, Unavailable):
-        return {}
-    if all(
-        name not in aid_results or aid_results[name].verdict == "disabled" for name in OUTDOOR_AIDS
-    ):
-        return {}
-    write_aids(page, aid_results)
-    return aid_results
+def outdoor_aids(analysis: Analysis) -> Mapping[str, AidResult]:
+    """Return EKF2's aiding sources if EKF2 fused GNSS or optical flow, else {}."""
+    aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
+    fused_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
+    return {} if fused_names.isdisjoint(OUTDOOR_AIDS) else aids
 
 
 def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
@@ -58,14 +52,13 @@ def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
-    """Write the table of EKF2's aiding sources and the findings."""
     write_aids(page, analysis.aids)
     page.heading("Findings")
     write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
-    """Write a table row for each aiding source and axis; below it, list the disabled sources."""
+    """Write a table with a row for each aiding source and axis."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
         if aid.verdict == "disabled":
@@ -122,7 +115,6 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
 
 
 def format_aid_verdict(aid: AidResult) -> str:
-    """Format the verdict on an aiding source, with the factor between reported and actual σ."""
     if aid.verdict == "not_fused":
         return f"not fused for up to {aid.longest_gap_duration_s:.1f} s"
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
@@ -136,8 +128,8 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
-        "were not fused; in grey times fusion was disabled. Values beyond "
-        f"±{MAX_NORMALISED:g} are drawn as triangles."
+        "were not fused. Grey: fusion was disabled. Triangles: values beyond "
+        f"±{MAX_NORMALISED:g}."
     )
     for name in fused_names:
         _draw_aid_panel(

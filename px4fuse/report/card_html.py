@@ -1,8 +1,4 @@
-"""Diagnosis card as HTML, for the web pages and notebooks.
-
-The axis of ratios is drawn with positions in percent, so it fits any width and needs no style
-attributes, which the security policy of the pages forbids.
-"""
+"""Diagnosis card as HTML, for the web pages and notebooks."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +11,6 @@ from px4fuse.card.model import (
     AXIS_TICKS,
     FILTER_NAMES,
     Card,
-    Rerun,
     Verdict,
     axis_fraction,
 )
@@ -38,7 +33,7 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-# SVG path of the symbol for a σ ratio: against source, ground truth, and beyond the axis ends
+# SVG path of each marker of a σ ratio; "below" and "above" are for ratios outside the axis
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -50,7 +45,7 @@ HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
 
 
 def card_of(analysis: Analysis) -> Card:
-    """Return the diagnosis card of an analysis, with the path of the log as typed."""
+    """Return the diagnosis card of an analysis."""
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
@@ -61,15 +56,14 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the card as an HTML element; :func:`card_style` has its style.
+    """Return the diagnosis card as an HTML element.
 
     Parameters
     ----------
-    card : Card
     is_open : bool
         True to show causes and notes without a click.
     has_apply : bool
-        True to add a button to each command of KF; a script has to handle ``data-apply``.
+        True for a button at each KF command, which the script of the page handles.
     """
     return load_template("report/card.html").render(
         card=card,
@@ -79,7 +73,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
         if card.verdicts and card.effect is not None
         else "",
         marked_actions=marked_actions,
-        rerun_rows=_rerun_rows,
+        rerun_rows=lambda reruns: zip(*rerun_columns(reruns), strict=True),
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
@@ -90,13 +84,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
 def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw σ ratios on their logarithmic axis as an HTML figure.
 
-    Parameters
-    ----------
-    all_verdicts : sequence of Verdict
-    axis : str
-        Direction of the errors with its reference.
-    name : str
-        Name of the axis, by which scripts find the figure on pages with several axes.
+    ``axis`` describes the direction of the errors; scripts find the figure by ``name``.
     """
     return load_template("report/card_axis.html").render(
         verdicts=all_verdicts,
@@ -145,15 +133,11 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     for verdict in verdicts:
         value = f"not evaluated, {verdict.reason}"
         if verdict.ratio is not None:
-            explained = ", explained" if verdict.is_explained else ""
-            value = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained}"
+            suffix = ", explained" if verdict.is_explained else ""
+            value = f"{format_ratio(verdict.ratio)}, {verdict.word}{suffix}"
         quantity = f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}"
         sentences.append(f"{quantity}: {value}.")
     return " ".join(sentences)
-
-
-def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    return list(zip(*rerun_columns(reruns), strict=True)) if reruns else []
 
 
 def _percent(ratio: float) -> str:
@@ -161,7 +145,8 @@ def _percent(ratio: float) -> str:
 
 
 def _drawing(verdict: Verdict) -> dict[str, Any]:
-    """Return the SVG attributes for one σ ratio: its consistent band, 95 % interval and mark."""
+    # SVG positions are percentages, so the axis fits any width without style attributes, which the
+    # security policy of the pages forbids
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in CONSISTENT_RATIOS[verdict.against])

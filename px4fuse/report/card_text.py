@@ -1,7 +1,4 @@
-"""Diagnosis card as text: lines of at most 100 columns, for terminals, pipes and files.
-
-Commands and the headline never wrap; other texts wrap with a hanging indent.
-"""
+"""Diagnosis card as text: lines of at most 100 columns, for terminals, pipes and files."""
 
 import json
 import re
@@ -32,7 +29,7 @@ CARD_WIDTH = 100
 AXIS_WIDTH = 37
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters left of a text beside a label
-# Maximum length of a command on the line of its label; longer commands have their own line
+# Maximum length of a command beside its label; longer commands have their own line
 MAX_COMMAND_LENGTH = 74
 # Ticks of the axis of σ ratios that have a label
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
@@ -58,17 +55,9 @@ CONSOLE_NOTE = "Console means the MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
-    """Paragraph of a card on the terminal.
+    """Line of a card on the terminal, in a style of rich.
 
-    Attributes
-    ----------
-    text : str
-    style : str
-        Style of rich.
-    first, indent : str
-        Text before the first line, and before the other lines.
-    wraps : bool
-        False for the headline, commands and tables.
+    If it ``wraps``, ``first`` precedes the first line and ``indent`` the other lines.
     """
 
     text: str
@@ -78,7 +67,6 @@ class Line(NamedTuple):
     wraps: bool = False
 
     def wrapped(self, width: int) -> list[str]:
-        """Wrap the paragraph at a width in columns."""
         if not self.wraps:
             return [f"{self.first}{self.text}"]
         return textwrap.wrap(
@@ -92,7 +80,6 @@ class Line(NamedTuple):
 
 
 def card_lines(card: Card) -> Iterator[Line]:
-    """Yield the paragraphs of a diagnosis card from top to bottom."""
     if card.severity == "refused":
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
@@ -124,7 +111,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, place: str) -> list[str]:
-    """Format the first notes of a card, and the number of the other notes with their place."""
+    """Format the first notes of a card; ``place`` lists the other notes."""
     texts = [
         " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
         for note in card.notes[:MAX_NOTES]
@@ -134,7 +121,7 @@ def note_texts(card: Card, place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a card: commands for details, and an explanation of the console."""
+    """Yield the last lines of a card: where to find details."""
     has_console = any(
         action.where == "console" for cause in card.causes for _, action in marked_actions(cause)
     )
@@ -144,7 +131,7 @@ def closing_lines(card: Card) -> Iterator[Line]:
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
-    """Replace the log's file name in all commands of a card by the path that the user typed.
+    """Replace the file name of the log in all commands of a card by the path that the user typed.
 
     >>> from px4fuse.card.model import Identity
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
@@ -196,8 +183,8 @@ def axis_text(ratio: float | None, reference: Reference) -> str:
     if ratio is not None:
         column = _column(ratio)
         is_inside = 0 <= column < AXIS_WIDTH
-        mark = MARKS[reference] if is_inside else "▶" if column > 0 else "◀"
-        characters[min(max(column, 0), AXIS_WIDTH - 1)] = mark
+        symbol = MARKS[reference] if is_inside else "▶" if column > 0 else "◀"
+        characters[min(max(column, 0), AXIS_WIDTH - 1)] = symbol
     return "".join(characters)
 
 
@@ -254,7 +241,6 @@ def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
 
 
 def format_target(action: Action) -> str:
-    """Format the target of an action with the program for its commands: "EKF2 (console)"."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -300,13 +286,12 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def rerun_start(reruns: Sequence[Rerun]) -> str:
-    """Return the sentence on the start time of EKF2's replay; "" if EKF2 was not replayed."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
     if not starts:
         return ""
     return (
-        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values are from the time "
-        f"after {min(starts):.0f} s without gaps."
+        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values exclude gaps and "
+        f"the time before {min(starts):.0f} s."
     )
 
 
@@ -315,11 +300,7 @@ def _change_text(
     format_value: Callable[[float], str],
     unit: str = "",
 ) -> str:
-    return (
-        ""
-        if before_and_after is None
-        else f"{format_value(before_and_after[0])} → {format_value(before_and_after[1])}{unit}"
-    )
+    return " → ".join(map(format_value, before_and_after)) + unit if before_and_after else ""
 
 
 def _percent(fraction: float) -> str:
@@ -331,16 +312,14 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
         return
     axis_text = "" if card.effect is None else f", {card.effect.axis}"
     yield Line("")
-    heading = "Reported uncertainty: RMS of actual ÷ reported"
+    heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
     yield from _wrapped_lines(f"{heading}{axis_text}", "", "  ")
     legend = f"  ░ consistent ({band_limits()})"
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line(
-            "  The causes below explain verdicts in brackets, which are not faults of the filter."
-        )
+        yield Line("  Verdicts in brackets are not faults of the filter: the causes explain them.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 
@@ -384,7 +363,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
 
 
 def format_spans(cause: Cause) -> str:
-    """Format the time from the begin to the end of a fault; "" for the whole flight."""
+    """Format the time from the first to the last occurrence of a fault."""
     if not cause.spans_s:
         return ""
     first_s, last_s = cause.spans_s[0][0], cause.spans_s[-1][1]

@@ -16,7 +16,7 @@ from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
 MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
-# Maximum distance of a drawn time offset from the estimate, in half widths of its 95 % interval
+# Half width of the plot, in half widths of the 95 % interval
 CURVE_HALF_WIDTH = 2.5
 # Ids of the findings for which the report has an appendix on the time offset
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
@@ -39,7 +39,7 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """Return sentences on the time offset of the position source and its correction, by label."""
+    """Return sentences on the time offset of the position source, and their labels as keys."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:
@@ -82,7 +82,6 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
 
 
 def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
-    """Format the action for EKF2's delay parameter of the position source."""
     name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
     if ml_delay_ms is None:
         return f"{name} {flown_ms:g} ms agrees with the estimate."
@@ -107,17 +106,16 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         (
             "Late or early timestamps hardly change the innovations, because the filter "
             "follows the positions. px4fuse maximises the likelihood of the positions over the "
-            "time offset, jointly with sensor biases, attitude errors and noises. The "
-            "attitude comes from the gyros alone. EKF2's attitude was corrected by the "
-            "same positions, so it is not used."
+            "time offset, together with sensor biases, attitude errors and noises. The attitude "
+            "is from the gyros, because the same positions have corrected EKF2's attitude."
         ),
     )
     page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
-        f"The log-likelihood has its maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to "
-        f"{high:+.3f} s. The interval also includes the IMU noise, so it is wider than the curve "
-        f"shows. {clock.count} measurements."
+        f"The log-likelihood of {clock.count} measurements has its maximum at {estimate_s:+.3f} "
+        f"s; 95 % interval {low:+.3f} to {high:+.3f} s. The interval also includes the IMU noise, "
+        "so it is wider than the curve shows."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)

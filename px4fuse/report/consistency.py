@@ -15,7 +15,7 @@ from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_caus
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings.cause_text import format_change, format_explained_share
+from px4fuse.findings.cause_text import format_change, format_explained_fraction
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
@@ -48,7 +48,7 @@ MAX_NON_WHITE_P = 0.01
 RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
-# Label of each tested statistic, and the exponent with which its value is printed
+# Label of each statistic, and exponent of the printed value (0.5: square root)
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -66,10 +66,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(
         "Appendix: consistency",
         (
-            "Innovations ν of a consistent filter have variance S (mean NIS = mean of "
-            "ν²/S = 1), are normally distributed with mean 0, and are white. Both "
-            f"filters are tested in the same way along {axis_text}; the table lists all "
-            "axes."
+            "Innovations ν of a consistent filter have variance S (mean NIS = mean of ν²/S = 1), "
+            "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
+            f"along {axis_text}; the table lists all axes."
         ),
     )
     series = _series(result)
@@ -124,7 +123,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of tested causes: KF and EKF2 re-run with one changed setting each."""
+    """Write the table of re-runs of KF and EKF2, each with one changed setting."""
     axis = analysis.main.axis
     tested: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
@@ -143,7 +142,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
                 format_change(analysis, trial),
                 label,
                 *(format_number(value**power, 2) for value in values),
-                format_explained_share(trial, statistic),
+                format_explained_fraction(trial, statistic),
             ]
         )
     if not rows:
@@ -153,9 +152,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
         (
-            "Each row is a re-run with one changed setting. 'all': the change makes the quantity "
-            "consistent. Otherwise: reduction of the logarithm of the quantity (for "
-            "distances: of the mean square). A change with 50 % or more is a cause."
+            "Each row is a re-run with one changed setting. 'explains' is the reduction of the "
+            "logarithm of the quantity (for distances: of the mean square); 'all' means that the "
+            "re-run is consistent. A change that explains 50 % or more is a cause."
         ),
         colour=MUTED_COLOUR,
     )
@@ -220,9 +219,9 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
         axes.vlines(positions, 0.0, r, color=LINES[name]["color"], lw=1.2)
         dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
         axes.plot(positions, r, **dots, label=name)
-        bound = _whiteness_bound(values)
-        axes.axhline(-bound, **_thin_line_style(name))
-        axes.axhline(bound, **_thin_line_style(name), label=f"95 % band {name}")
+        half_band = _whiteness_half_band(values)
+        axes.axhline(-half_band, **_thin_line_style(name))
+        axes.axhline(half_band, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -230,7 +229,7 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
     axes.set_xlabel("lag (measurements)")
 
 
-def _whiteness_bound(values: pd.Series[float]) -> float:
+def _whiteness_half_band(values: pd.Series[float]) -> float:
     """Return the half width of the 95 % band of the autocorrelation of white noise."""
     return float(1.96 / np.sqrt(len(values)))
 
@@ -239,10 +238,10 @@ def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
     for name, values in series.items():
         consistency = filters_by_name(result)[name]
-        assert isinstance(consistency, Consistency)  # filters without innovations have no series
+        assert isinstance(consistency, Consistency)
         r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
-        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):
+        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_half_band(values):
             interpretation = f"{name} {'lags' if r > 0.0 else 'follows measurement noise'}"
         sentences.append(
             f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "

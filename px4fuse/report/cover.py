@@ -1,7 +1,4 @@
-"""Cover of a report: the diagnosis card, and plots below it.
-
-``cover.typ`` places the texts of the card.
-"""
+"""Cover of a report: the diagnosis card, and plots below it."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -42,10 +39,10 @@ from px4fuse.results.contract import AidsResults, ComparisonResults
 
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
 AXIS_TITLE = "Is the reported uncertainty right?"
-AXIS_TEXT = "RMS of actual ÷ reported"
+AXIS_TEXT = "RMS of actual error ÷ reported σ"
 TERMS_NOTE = (
-    "Source: positions that both filters fuse. σ, √S: standard deviation that a filter reports for "
-    "its position and for an innovation. KF: filter with position and velocity along one axis, IMU "
+    "Source: positions that KF and EKF2 fuse. σ and √S: standard deviations of position and "
+    "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "
     "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
 AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
@@ -54,7 +51,7 @@ ALL_FINDINGS = "All findings"
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots in the height below it."""
+    """Draw the cover: the diagnosis card, and plots in the space below it."""
     page = Page()
     block = add_card(page, results.card)
     write_panels(block, analysis, results.card, free_height(page))
@@ -69,7 +66,7 @@ def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add the texts of a card to a page; plots are added to ``blocks`` of the result."""
+    """Add a diagnosis card to a page."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
     more_causes = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
@@ -104,7 +101,6 @@ def add_card(page: Page, card: Card) -> Block:
 
 
 def free_height(page: Page) -> float:
-    """Return the height (points) below the card on the last page of the card."""
     return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
 
 
@@ -121,14 +117,13 @@ def _shorten_middle(name: str) -> str:
 
 
 def _axis_data(card: Card) -> dict[str, Any]:
-    """Return heading, ticks and rows of the logarithmic axis of σ ratios."""
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
     ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
     axis_text = f", {card.effect.axis}" if card.effect else ""
     return {
         "axis_title": AXIS_TITLE,
         "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
-        "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ beyond {ends}",
+        "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ outside {ends}",
         "ticks": [
             {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
         ],
@@ -139,14 +134,14 @@ def _axis_data(card: Card) -> dict[str, Any]:
 def _verdict_row(verdict: Verdict) -> dict[str, Any]:
     label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
-    word = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
+    verdict_text = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
     if verdict.ratio is None:
-        word = f"not evaluated: {verdict.reason}"
+        verdict_text = f"not evaluated: {verdict.reason}"
     return {
         "filter": verdict.filter,
         "label": label,
         "quantity": quantity,
-        "word": word,
+        "word": verdict_text,
         "quiet": verdict.is_explained,
         "loud": verdict.is_fault,
         **_ratio_marks(verdict.ratio, verdict.against, verdict.interval),
@@ -168,7 +163,6 @@ def _aid_row(row: AidRow) -> dict[str, Any]:
 def _ratio_marks(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the positions of a σ ratio, its interval and its band on the axis (0 to 1)."""
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
     beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {

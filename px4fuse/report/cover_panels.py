@@ -35,7 +35,7 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum ratio of length to width of a track, for plots that fill the page width
+# Ratio of length to width of a track above which the plots fill the page width
 MIN_LONG_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
@@ -53,9 +53,9 @@ TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
 TITLE_LINE = 10.5  # height (points) of each further line of a title
 # Unused height (points): gap above the legend, and gap below the last plot
 UNUSED_HEIGHT = 15.0
-# Minimum height (points) of the innovation plot for ticks at ±2 in addition to -4, 0 and 4
+# Minimum height (points) of the innovation plot with ticks at ±2
 MIN_TICKS_HEIGHT = 48.0
-# Minimum width (points) of a plot for six ticks of the time axis
+# Minimum width (points) of a plot with six ticks on the time axis
 MIN_WIDE_PANEL = 200.0
 LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
 # Fraction of the height of all plots that the innovation plot fills
@@ -68,27 +68,27 @@ MAX_NORMALISED = 4.0
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 # Ratio of the length of the map to the length of the tracks
 MAP_MARGIN = 1.08
-# Maximum distance of the map's edge from the positions, as a fraction of their extent
+# Maximum distance from the positions to the edge of the map, as a fraction of their extent
 MAP_REACH = 0.25
 MIN_MAP_LENGTH_M = 0.5
-# Maximum ratio of the largest to the smallest σ, for a title that states the median σ only
+# A title states the median of σ if the ratio of maximum to minimum is smaller, else the range
 MAX_SIGMA_RATIO = 1.5
-# Time (s) in which σ decreases at the start of the filter; not included in σ of titles
+# Time (s) in which σ decreases at the start of the filter, excluded from σ in titles
 SETTLING_S = 2.0
 Coordinates = tuple[Array, Array]
 
 
 class TimePlot(NamedTuple):
-    """Small plot over time: title, and the function that draws it."""
+    """Small plot over time."""
 
     title: str
     draw: Callable[[Axes], None]
 
 
 class FlightMap(NamedTuple):
-    """Tracks seen from above, in metres to the right and upwards, with the axis labels.
+    """Tracks seen from above: coordinates (m) to the right and upwards.
 
-    The map uses the first of ``right_labels`` that fits its width.
+    ``right_labels`` are labels of the horizontal axis, the longest first.
     """
 
     tracks: Mapping[str, Coordinates]
@@ -97,22 +97,12 @@ class FlightMap(NamedTuple):
 
     @property
     def is_long(self) -> bool:
-        """True if the track is so long and narrow that the plots fill the page width."""
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
-    """Draw legend, map and plots over time into the block of the cover.
-
-    Parameters
-    ----------
-    block : Block
-    analysis : Analysis
-    card : Card
-    free_height : float
-        Height (points) that is left on the page.
-    """
+    """Draw legend, map and plots over time on the cover; ``free_height`` in points."""
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
@@ -148,7 +138,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
 def _draw_plots(
     page: Page, analysis: Analysis, plots: Sequence[TimePlot], heights: Sequence[float]
 ) -> None:
-    """Draw plots on one time axis; their heights (points) include titles and labels."""
+    """Draw plots over time; their heights (points) include titles and labels."""
     for plot, height in zip(plots, heights, strict=True):
         is_last = plot is plots[-1]
         axes_height = height - _head_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
@@ -160,10 +150,10 @@ def _draw_plots(
 
 
 def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[float]:
-    """Return heights (points) of plots that add up to a total, for axes of equal height."""
-    extras = [_head_height(page, plot.title) for plot in plots]
-    axes_height = (total - sum(extras)) / max(len(plots), 1)
-    return [axes_height + extra_height for extra_height in extras]
+    """Return heights (points) of plots whose axes have equal height."""
+    title_heights = [_head_height(page, plot.title) for plot in plots]
+    axes_height = (total - sum(title_heights)) / max(len(plots), 1)
+    return [axes_height + title_height for title_height in title_heights]
 
 
 def _tick_count(page: Page) -> int:
@@ -175,7 +165,7 @@ def _head_height(page: Page, title: str) -> float:
 
 
 def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
+    """Return a plot of the position error of each filter; without ground truth of KF - EKF2."""
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
         filter_name: errors
@@ -207,8 +197,8 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         name: pd.Series(reported_sigma(time_s, frame, "position_variance_m2"), time_s)
         for name, frame in (("KF", variance), ("EKF2", result.ekf2_variance))
     }
-    widest = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
-    half_height = 1.1 * max(float(difference.abs().max()), *widest)
+    limits_m = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
+    half_height = 1.1 * max(float(difference.abs().max()), *limits_m)
     size = _format_size("RMS", effect.difference_rms_m if effect else None)
     return [_error_plot("KF − EKF2 (m)", size, difference, sigmas, half_height)]
 
@@ -224,7 +214,6 @@ def _error_plot(
     sigmas: Mapping[str, pd.Series[float]],
     half_height: float,
 ) -> TimePlot:
-    """Return the plot of a position error or of KF - EKF2 (m), with ±2σ of each filter."""
     known_sigmas = {
         name: known for name, sigma in sigmas.items() if not (known := sigma.dropna()).empty
     }
@@ -247,7 +236,6 @@ def _error_plot(
 
 
 def _shown_height(errors: pd.DataFrame) -> float:
-    """Return the largest position error (m) of a filter, or 2.2 σ if that is not much larger."""
     largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
     return max(
         largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
@@ -255,7 +243,6 @@ def _shown_height(errors: pd.DataFrame) -> float:
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    """Format the range of σ (m) after :data:`SETTLING_S`, or its median if it hardly changes."""
     settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SETTLING_S, sigma.index[-1])]
     low, high = float(settled_sigma.min()), float(settled_sigma.max())
     if high < MAX_SIGMA_RATIO * low:
@@ -264,17 +251,16 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
 
 
 def _innovation_plot(result: AxisComparison) -> TimePlot:
-    """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
     series = normalised_innovations(result)
     symbols = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
     title = f"Innovations ÷ √S ({symbols}): 95 % expected within ±2"
-    beyond = [
-        f"{name} {format_ratio(size)}"
+    largest = [
+        f"{name} {format_ratio(ratio)}"
         for name, values in series.items()
-        if (size := float(values.abs().max())) > MAX_NORMALISED
+        if (ratio := float(values.abs().max())) > MAX_NORMALISED
     ]
-    if beyond:
-        title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
+    if largest:
+        title += f"; ▲▼ outside ±{MAX_NORMALISED:g}, up to {', '.join(largest)}"
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_NORMALISED, 1.12 * MAX_NORMALISED)
@@ -289,7 +275,7 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
 
 
 def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
-    """Return north and east (m) of positions, KF, EKF2 and ground truth within the segment."""
+    """Return north and east (m) of positions, KF, EKF2 and ground truth."""
     segment, flight = analysis.segment.flight, analysis.flight
 
     def cut(track: pd.DataFrame) -> Coordinates:
@@ -310,7 +296,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map along the main axis, at a heading below 180°; without it, north is up."""
+    """Return the map with the main axis to the right; without a main axis, north is up."""
     aisle = next((line for line in analysis.lines if line.name == AISLE), None)
     heading, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle is not None and aisle.heading_deg is not None:
@@ -329,7 +315,6 @@ def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
-    """Draw the tracks at equal scales; the title names the tracks that leave the map."""
     tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT
     title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
     limits = _map_limits(tracks, width / axes_height)
@@ -368,18 +353,15 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
 
 
 def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner of the map (m).
-
-    The map shows all ground truth and 98 % of the positions, and the other tracks up to
-    :data:`MAP_REACH` outside of these, so a large error of a filter does not reduce the scale.
-    """
+    """Return the lower left and the upper right corner of the map (m)."""
+    # MAP_REACH limits the other tracks, so a large error of a filter does not reduce the scale
     middles, sizes = [], []
     for side in (0, 1):
         ends = [np.percentile(tracks["positions"][side], (1.0, 99.0))]
         if "ground truth" in tracks:
             ends.append(_range_of(tracks["ground truth"][side]))
-        reach = MAP_REACH * (np.max(ends) - np.min(ends))
-        limits = np.min(ends) - reach, np.max(ends) + reach
+        margin_m = MAP_REACH * (np.max(ends) - np.min(ends))
+        limits = np.min(ends) - margin_m, np.max(ends) + margin_m
         ends += [np.clip(_range_of(track[side]), *limits) for track in tracks.values()]
         middles.append(0.5 * (np.min(ends) + np.max(ends)))
         sizes.append(max(MAP_MARGIN * (np.max(ends) - np.min(ends)), MIN_MAP_LENGTH_M))

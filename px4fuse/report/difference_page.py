@@ -37,7 +37,7 @@ INCREASE_STYLE = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the contribution of each EKF2 setting to KF - EKF2; no page if none is known."""
+    """Draw the contribution of each EKF2 setting to the difference KF - EKF2."""
     explanations = _axis_explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
@@ -58,20 +58,20 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         else:
             _draw_axis(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
-    assert isinstance(replay, Ekf2Replay)  # explanations of the difference need a replay
+    assert isinstance(replay, Ekf2Replay)
     assert replay.agreement is not None
     page.write_small(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
 
 
 def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation of KF - EKF2 along the main axis; without a main axis, of all axes."""
+    """Return the explanations of KF - EKF2 along the aisle, else along all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the largest contribution to KF - EKF2, or the reason for a missing explanation."""
+    """Write the explanation of KF - EKF2, or the reason why it is missing."""
     if isinstance(explanation, Unavailable):
         page.write_labelled(
             "KF-EKF2", f"The difference KF - EKF2 is not explained: {explanation.reason}."
@@ -105,11 +105,12 @@ def format_agreement(agreement: Agreement) -> str:
     )
     return (
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
-        f"Correlation of {agreement.samples} innovations {correlation}; S ratio replay/log "
-        f"{ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
+        f"Correlation of {agreement.samples} innovations {correlation}; S of the replay ÷ S of the "
+        f"log {ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
         f"{agreement.rejected_fraction_logged:.1%})"
         + "".join(
-            f". The replay of {AIDS[name].label} does not agree and is not used: {reason}"
+            f". The replay of {AIDS[name].label} does not agree with the log and is not used: "
+            f"{reason}"
             for name, reason in agreement.doubtful.items()
         )
     )
@@ -161,25 +162,27 @@ def _draw_axis(
         draw_curve(axes, remainder.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
 
-def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_share: float) -> None:
+def _draw_waterfall(
+    axes: Axes, names: list[str], reductions: Array, unexplained_percent: float
+) -> None:
     """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
-    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
+    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions)])
     rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}
     axes.barh(0, 100.0, **style)
-    for row, (share, bar_start) in enumerate(zip(shares, bar_ends, strict=False), start=1):
-        style |= {"color": KF_BAND_COLOUR, "hatch": ""} if share >= 0.0 else INCREASE_STYLE
-        axes.barh(row, -share, left=bar_start, **style)
+    for row, (reduction, bar_start) in enumerate(zip(reductions, bar_ends, strict=False), start=1):
+        style |= {"color": KF_BAND_COLOUR, "hatch": ""} if reduction >= 0.0 else INCREASE_STYLE
+        axes.barh(row, -reduction, left=bar_start, **style)
         axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
     style |= {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR, "hatch": ""}
-    axes.barh(rows - 1, unexplained_share, **style)
-    for row, percent in enumerate((100.0, *shares, unexplained_share)):
+    axes.barh(rows - 1, unexplained_percent, **style)
+    for row, percent in enumerate((100.0, *reductions, unexplained_percent)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
         axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
     axes.set_yticks(range(rows), ["KF - EKF2, total", *names, "unexplained"])
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
-    axes.set_xlabel("% of the mean square")
+    axes.set_xlabel("% of the mean square difference")
     axes.grid(visible=False)
 
 

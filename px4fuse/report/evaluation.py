@@ -1,4 +1,4 @@
-"""Page on trajectory errors: map coloured by error, APE and RPE (the names of the tool evo)."""
+"""Page on trajectory errors: map coloured by error, APE and RPE."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -16,7 +16,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
-# Indices of the axes that the map shows to the right and upwards
+# Indices of the horizontal and the vertical axis of the map
 MAP_AXES: Mapping[Frame, tuple[int, int]] = {
     "NED": (1, 0),
     "FRD": (1, 0),
@@ -24,7 +24,7 @@ MAP_AXES: Mapping[Frame, tuple[int, int]] = {
     "camera": (0, 2),
     "unknown": (0, 1),
 }
-# Minimum interval between two poses that is drawn as a gap, relative to the median interval
+# Intervals between poses above this multiple of the median interval are drawn as gaps
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
@@ -51,7 +51,6 @@ ERROR_TABLE_HEAD = (
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
-    """Draw the evaluation of a trajectory: ATE and RPE, maps and error plots."""
     page = Page(
         "Trajectory error",
         (
@@ -119,7 +118,9 @@ def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     left, right = halves()
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
-    draw_ape(axes, evaluation, *time_from_start(evaluation))
+    origin_s = time_origin_s(evaluation)
+    label = "time from the first pose (s)" if origin_s else "time (s)"
+    draw_ape(axes, evaluation, evaluation.time_s - origin_s, label)
     page.legend(axes.get_legend_handles_labels()[0])
     axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
@@ -127,7 +128,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     page.add_columns(left, right)
     if _rpe_statistics(evaluation):
         left, right = halves()
-        _draw_rpe(left.panel("RPE per delta (m)", "", PANEL_HEIGHT), evaluation)
+        _draw_rpe(left.panel("RPE for each delta (m)", "", PANEL_HEIGHT), evaluation)
         right.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
         page.add_columns(left, right)
 
@@ -162,17 +163,11 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xticks(shown_indices, [rpe_statistics[index][0].delta_text for index in shown_indices])
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
-    axes.set_xlabel("delta")
+    axes.set_xlabel("delta: distance, time or number of frames")
 
 
 def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
     return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
-
-
-def time_from_start(evaluation: Evaluation) -> tuple[Array, str]:
-    """Return the time of each pose (s) on the time axis, and the label of the axis."""
-    origin_s = time_origin_s(evaluation)
-    return evaluation.time_s - origin_s, "time from the first pose (s)" if origin_s else "time (s)"
 
 
 def _gap_indices(time_s: Array) -> IntArray:
@@ -193,7 +188,7 @@ def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None
 
 
 def time_origin_s(evaluation: Evaluation) -> float:
-    """Return the time (s) of the first pose if timestamps are UNIX time, else 0."""
+    """Return the time of the first pose (s) if timestamps are UNIX time, else 0."""
     start = float(evaluation.time_s[0])
     return start if start > MIN_UNIX_TIME_S else 0.0
 
@@ -212,7 +207,6 @@ def summary(evaluation: Evaluation) -> str:
 
 
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:
-    """Write estimate, reference, method and the table of error statistics."""
     page.write_labelled("Estimate", describe_track(evaluation.estimate_track))
     page.write_labelled("Against", describe_track(evaluation.reference_track))
     page.write_labelled("Method", describe_method(evaluation))
@@ -227,7 +221,6 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return the rows of the error table: ATE, then each RPE."""
     errors: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
@@ -245,7 +238,6 @@ def error_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def missing_reasons(evaluation: Evaluation) -> list[str]:
-    """Return a sentence on each missing error statistic, without repetitions."""
     quantities = [
         evaluation.ate.interval_m,
         evaluation.ate.rotation_deg,
@@ -258,7 +250,6 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
 
 
 def unaligned_sentence(evaluation: Evaluation) -> str:
-    """Return the caption of the map before alignment: RMSE and alignment transform."""
     estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
@@ -283,7 +274,6 @@ def quarter_rmse(evaluation: Evaluation) -> list[float]:
 
 
 def quarters_sentence(evaluation: Evaluation) -> str:
-    """Return the caption of the APE over distance: RMSE of each quarter of the path."""
     rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
     return (
         f"RMSE per quarter of the path: {rmse_text} m. An error by drift grows along the path; "
@@ -292,7 +282,7 @@ def quarters_sentence(evaluation: Evaluation) -> str:
 
 
 def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
-    """Return the caption of the RPE plot: growth of the RPE with the distance or time."""
+    """Return the caption of the RPE plot: growth of the RPE with distance or time."""
     interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
@@ -315,12 +305,10 @@ def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
 
 
 def format_interval(interval: Interval | Unavailable) -> str:
-    """Format an interval as "low–high"; "" if it is unavailable."""
     return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
 
 
 def describe_track(path: Trajectory) -> str:
-    """Format name, kind, number of poses, duration and frame of a trajectory."""
     return (
         f"{path.name}: {path.kind}, {len(path)} poses over "
         f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
@@ -328,12 +316,12 @@ def describe_track(path: Trajectory) -> str:
 
 
 def describe_method(evaluation: Evaluation) -> str:
-    """Format alignment, number of pose pairs and time offset of an evaluation."""
     association = evaluation.association
     offset = evaluation.time_offset.offset_s
     offset_text = "" if not offset else f"; time offset {offset:+.3f} s"
     return (
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
-        f"{association.poses} pose pairs, {association.coverage_estimate:.0%} of the "
-        f"estimate and {association.coverage_reference:.0%} of the reference's time{offset_text}"
+        f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
+        f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
+        f"reference{offset_text}"
     )

@@ -29,7 +29,7 @@ MIN_MARK_DISTANCE = 1.0 / 300.0
 
 
 class Mark(NamedTuple):
-    """Events of one type on a time axis: markers at `height` (0 to 1), else bands."""
+    """Events of one type on a time axis: markers at a height (0 to 1), or bands without height."""
 
     label: str
     spans_or_times: Sequence[Any] | Array

@@ -1,8 +1,4 @@
-"""Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time.
-
-The main axis has two pages, with a plot of single predictions and updates. The other axes share one
-page.
-"""
+"""Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time."""
 
 from collections.abc import Iterator
 
@@ -20,9 +16,9 @@ from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATES = 15  # number of updates in the plot of single predictions and updates
-MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of single predictions and updates
-ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of single predictions and updates
+ZOOM_UPDATES = 15  # number of updates in the plot of a few updates
+MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of a few updates
+ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of a few updates
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -73,10 +69,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the plot of a few updates.
-
-    The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
-    """
+    """Return start and end (s) of the plot of a few updates in the middle of the flight."""
     times = result.replay.updates.index.to_numpy()
     if len(times) < 2:
         return segment.start_s, min(segment.start_s + MIN_ZOOM_S, segment.end_s)
@@ -112,7 +105,6 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """Return the caption: σ_p of KF and EKF2 before and after an update."""
     texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
@@ -138,7 +130,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one column for each axis other than the main axis; no page without such an axis."""
+    """Draw one column for each axis other than the main axis."""
     secondary_axes = analysis.secondary_axes
     if not secondary_axes:
         return

@@ -80,7 +80,9 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
-    _draw_map(page, loop)
+    axes = page.panel("Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0)
+    draw_map(axes, loop)
+    page.legend(axes.get_legend_handles_labels()[0])
     page.heading("Loop closures and scores")
     page.write(
         (
@@ -93,25 +95,16 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     write_scores(page, loop)
 
 
-def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """Return the corrected paths that the map shows."""
-    return [path for path in loop.reported_paths if path.name in PATH_STYLES]
-
-
-def _draw_map(page: Page, loop: Loop) -> None:
-    axes = page.panel("Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0)
-    draw_map(axes, loop)
-    page.legend(axes.get_legend_handles_labels()[0])
-
-
 def draw_map(axes: Axes, loop: Loop) -> None:
     """Draw the uncorrected and corrected paths from above, with the closure error as an arrow."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
-    for corrected_path in shown_paths(loop):
+    for corrected_path in loop.reported_paths:
         track, name = corrected_path.trajectory, corrected_path.name
-        plot_path(axes, track.position_m[:, (1, 0)], track.time_s, label=name, **PATH_STYLES[name])
+        if name in PATH_STYLES:
+            horizontal_m = track.position_m[:, (1, 0)]
+            plot_path(axes, horizontal_m, track.time_s, label=name, **PATH_STYLES[name])
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
@@ -264,15 +257,14 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """Format the closure error in m, in percent of the path length, and its heading error."""
-    error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
-    if error is None or misclosure is None:
+    error_m, error_axes_m = loop.closure_error_m, loop.closure_error_axes_m
+    if error_m is None or error_axes_m is None:
         if loop.is_assessed:
-            return f"none for a path of {loop.path_length_m:.1f} m: px4fuse withholds its diagnosis"
-        return f"none: the path of {loop.path_length_m:.1f} m does not return to its start (--open)"
+            return f"not stated for an assignment; the path is {loop.path_length_m:.1f} m long"
+        return f"the path of {loop.path_length_m:.1f} m does not return to its start (--open)"
     text = (
-        f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "
-        f"{format_vector(misclosure)}"
+        f"{error_m:.2f} m after {loop.path_length_m:.1f} m ({error_m / loop.path_length_m:.2%}): "
+        f"{format_vector(error_axes_m)}"
     )
     heading_deg = loop.heading_error_deg
     if isinstance(heading_deg, Unavailable):
@@ -281,7 +273,6 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    """Format the chi-square test of a loop closure."""
     verdict = "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
@@ -298,7 +289,7 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 
 def by_distance_sentence(loop: Loop) -> str:
-    """Explain the correction of the path by distance; "" if the loop has none."""
+    """Explain the correction of the path in proportion to distance; "" if it was not made."""
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
@@ -313,7 +304,6 @@ def by_distance_sentence(loop: Loop) -> str:
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return a sentence on each missing correction of the path, without repetitions."""
     unavailable = [
         correction
         for correction in loop.corrections.values()
@@ -339,7 +329,6 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def format_correction(correction: CorrectedPath) -> str:
-    """Format RMS and maximum (m) of the position change by a correction."""
     if not correction.correction_max_m:
         return "–"
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"

@@ -1,7 +1,6 @@
-"""Page with the answer form and the student's notes (Markdown as plain text, lists and tables).
+"""Page with the answer form and the notes (Markdown) of the student.
 
-Mathematics in dollar signs becomes Unicode text (σ, ≤, √), a picture becomes its description, and
-HTML tags are removed. Nothing is loaded or executed.
+HTML tags are removed, pictures are not loaded, and TeX becomes Unicode text.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ SYMBOLS = {
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes of the student; no page without both."""
+    """Draw the answer form and the notes of the student, if there are any."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
@@ -80,13 +79,7 @@ def write(page: Page, notes: str) -> None:
 
 
 def parse(notes: str, name: str = "the notes") -> list[Token]:
-    """Parse Markdown into tokens.
-
-    Parameters
-    ----------
-    notes : str
-    name : str
-        Name of the text in error messages.
+    """Parse Markdown into tokens; ``name`` is the name of the text in errors.
 
     Raises
     ------
@@ -113,7 +106,6 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
-    """Write the child blocks of a Markdown node; `mark` precedes the first line of a list item."""
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
@@ -170,7 +162,7 @@ def _node_text(node: SyntaxTreeNode) -> str:
 
 
 def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Parse mathematics between dollar signs as a rule of markdown-it."""
+    """Parse mathematics between dollar signs: a rule of markdown-it."""
     maths_match = MATHS_PATTERN.match(state.src, state.pos)
     if maths_match is None:
         return False
@@ -186,6 +178,6 @@ def _tex_to_text(maths: str) -> str:
 
 
 def _maths_symbol(command_match: re.Match[str]) -> str:
-    """Return the Unicode character of a TeX command, from HTML entities with the same name."""
+    """Return the Unicode character of a TeX command, often the HTML entity of the same name."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

@@ -1,7 +1,6 @@
-"""Pages as data: ordered blocks of titles, text, tables and panels.
+"""Pages of reports: ordered blocks of titles, text, tables and plots.
 
-``report.typ`` sets them as PDF, :mod:`px4fuse.report.screen` prints text and tables on the
-terminal. Text from outside (names, notes) is data and is never interpreted as markup.
+``report.typ`` typesets the blocks as PDF, :mod:`px4fuse.report.screen` prints them on the terminal.
 """
 
 from __future__ import annotations
@@ -33,13 +32,7 @@ Cell = str | tuple[str, str]
 
 
 class Page:
-    """Section of a report, or a column of a section.
-
-    Attributes
-    ----------
-    blocks : list of Block
-        Content in order; panels contain their figures until :func:`to_typst_data` converts them.
-    """
+    """Section of a report, or a column of a section."""
 
     def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
         self.blocks: list[Block] = []
@@ -48,7 +41,7 @@ class Page:
             self.add("title", text=title, lead=lead)
 
     def add(self, kind: str, **fields: Any) -> Block:
-        """Add a block, which ``report.typ`` typesets according to its kind, and return it."""
+        """Add a block of a kind that ``report.typ`` defines, and return it."""
         self.blocks.append({"kind": kind, **fields})
         return self.blocks[-1]
 
@@ -63,17 +56,15 @@ class Page:
         indent: float = 0.0,
         mark: str = "",
     ) -> None:
-        """Write a paragraph; `above` and `indent` in points, `mark` before a list item."""
+        """Write a paragraph; lengths in points, ``mark`` precedes a list item."""
         if text or mark:
             block = styled_text(text, size, colour, bold)
             self.add("text", above=above, indent=indent, mark=mark, **block)
 
     def heading(self, text: str) -> None:
-        """Write a heading within the page."""
         self.add("heading", **styled_text(text, 9.5, bold=True))
 
     def write_small(self, text: str) -> None:
-        """Write a grey text close below a plot or table, for example its numbers."""
         self.write(text, colour=MUTED_COLOUR, above=-1.0)
 
     def write_labelled(
@@ -85,13 +76,11 @@ class Page:
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label and, right of it, paragraphs."""
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, 8.0, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
-        """Write each text of a mapping beside its label."""
         for label, text in texts.items():
             self.write_labelled(label, text)
 
@@ -135,14 +124,7 @@ class Page:
     ) -> Axes:
         """Add axes below a title and a caption; return the axes.
 
-        Parameters
-        ----------
-        height : float
-            Height of the axes alone (points).
-        above, left, right : float
-            Margins of the axes (points); the height of tick and axis labels is added below.
-        is_compact : bool
-            Small title and gaps, for the cover.
+        ``height`` of the axes and margins ``above``, ``left`` and ``right`` are in points.
         """
         # imported here, because text-only commands do not need matplotlib (0.3 s)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -168,7 +150,6 @@ class Page:
         return axes
 
     def legend(self, entries: Iterable[Artist]) -> Block:
-        """Add a legend on as many lines as its entries need."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
@@ -208,13 +189,12 @@ class Page:
         )
 
     def add_columns(self, *columns: Page, above: float = 6.0) -> None:
-        """Add columns side by side, below a gap of `above` points."""
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
 
 
 def halves(left_fraction: float = 0.5) -> tuple[Page, Page]:
-    """Return two columns that fill the page; the left one has `left_fraction` of the width."""
+    """Return a left and a right column that fill the page."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
 
@@ -256,7 +236,6 @@ def appendix_title(title: str) -> str:
 
 
 def draw_legend_above(axes: Axes) -> None:
-    """Draw the legend of axes above them, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
@@ -304,7 +283,6 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 
 def _place_axes(block: Mapping[str, Any]) -> None:
-    """Set the height of the figure and the position of its axes according to the labels."""
     axes, width, height = block["axes"], block["width"], block["height"]
     left, right, above = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]

@@ -27,14 +27,14 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Half height of the innovation plot divided by the larger of 2√S and the 99 % quantile of |ν|
+# Margin factor of the axis of innovations
 EDGE_FACTOR = 1.3
-# Upper limit of the 99 % quantile of |ν|, in √S, for the height of the innovation plot
+# Maximum limit (in √S) of the axis of innovations
 MAX_EDGE_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Columns and fields with the values of position or velocity, and their unit."""
+    """Position or velocity: its unit, and its names in tables and results."""
 
     unit: str
     column: str
@@ -52,7 +52,7 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """Plot over time along one axis: title, height (points), drawing, caption and numbers."""
+    """Plot over time along one axis; ``height`` of the axes in points."""
 
     title: str
     height: float
@@ -69,20 +69,12 @@ class Panel(NamedTuple):
         with_time_label: bool,
         is_narrow: bool = False,
     ) -> None:
-        """Draw the plot of one axis on a page.
-
-        Parameters
-        ----------
-        with_time_label : bool
-            Label the time axis, which all panels above share.
-        is_narrow : bool
-            Draw the plot in a narrow column: without caption, with the numbers below the plot.
-        """
+        """Draw the plot on a page; a narrow plot has no caption."""
         title, caption, height, numbers = self.title, "", NARROW_HEIGHT, self.numbers(result)
         if not is_narrow:
             caption, height = self.caption(analysis, result), self.height
             title, numbers = ": ".join(filter(None, (title, numbers))), ""
-        # the plot of innovations shows rejected positions as hollow dots, so it has no other mark
+        # innovations that EKF2 rejected are already drawn as hollow dots
         rejection_axis = "" if self is INNOVATIONS else result.axis.name
         axes = event_marks.panel(
             page,
@@ -129,7 +121,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
             draw_curve(axes, track[quantity.column], **LINES[name], zorder=2.5)
             drawn_series.append(track[quantity.column])
     draw_curve(axes, kf_values, **LINES["KF"])
-    # The axis is scaled to the tracks, because the ±2σ band is very wide in the first second
+    # the ±2σ band is very wide in the first second, so the axis is scaled to the tracks
     all_values = pd.concat(drawn_series)
     pad = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - pad, all_values.max() + pad)
@@ -141,7 +133,6 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _error_numbers(result: AxisComparison, quantity: Quantity) -> list[str]:
-    """Format the RMSE of each filter against ground truth."""
     values = {
         name: getattr(filter_summary.truth, quantity.rmse, None)
         for name, filter_summary in filters_by_name(result).items()
@@ -171,14 +162,14 @@ def _velocity_numbers(result: AxisComparison) -> str:
 
 
 def _axis_half_height(result: AxisComparison) -> float:
-    """Return the half height (m) of the plot of innovations, which outliers do not enlarge."""
     half_heights_m = []
     for innovations in (result.replay.updates, result.ekf2_innovations):
         if isinstance(innovations, pd.DataFrame):
             median_sigma = float(np.sqrt(innovations["innovation_variance_m2"].median()))
-            usual_innovation = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
+            # a quantile, so that outliers do not enlarge the axis
+            quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
             half_heights_m.append(
-                max(2.0 * median_sigma, min(usual_innovation, MAX_EDGE_SIGMAS * median_sigma))
+                max(2.0 * median_sigma, min(quantile_m, MAX_EDGE_SIGMAS * median_sigma))
             )
     return EDGE_FACTOR * max(half_heights_m)
 
@@ -197,13 +188,13 @@ def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]
 def draw_dots(
     axes: Axes, values: pd.Series[float], limit: float, marker_style: dict[str, Any]
 ) -> None:
-    """Draw dots between -limit and limit, and triangles there for values beyond."""
+    """Draw dots between -limit and limit; values outside are triangles at the limits."""
     draw_curve(axes, values[values.abs() <= limit], **marker_style)
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
-        beyond = values[sign * values > limit]
+        outside = values[sign * values > limit]
         triangles = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
-        if len(beyond):
-            draw_curve(axes, 0.0 * beyond + sign * limit, **triangles)
+        if len(outside):
+            draw_curve(axes, 0.0 * outside + sign * limit, **triangles)
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
@@ -231,7 +222,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """Return the caption of the innovations: verdict, mean, standard deviation and rejections."""
+    """Return the caption of the innovation plot."""
     half_height, sentences = _axis_half_height(result), []
     innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
@@ -239,7 +230,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {consistency.reason}.")
             continue
         table = innovation_tables[name]
-        assert isinstance(table, pd.DataFrame)  # filters with a verdict have innovations
+        assert isinstance(table, pd.DataFrame)
         outside_count = int((table["innovation_m"].abs() > half_height).sum())
         outside = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
@@ -257,12 +248,12 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _innovation_numbers(result: AxisComparison) -> str:
-    shares = ", ".join(
+    fractions = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
         for name, consistency in filters_by_name(result).items()
         if isinstance(consistency, Consistency)
     )
-    return f"{shares} outside ±2√S (expected 5 %)" if shares else ""
+    return f"{fractions} outside ±2√S (expected 5 %)" if fractions else ""
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
@@ -273,7 +264,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
-    """Return the caption of σ: its growth in the longest gap of the position source."""
+    """Return the caption of the σ plot: growth of σ in the longest gap of the position source."""
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])

@@ -54,7 +54,6 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
 
 
 def _title_name_hash(results: Any) -> tuple[str, str, str]:
-    """Return the title of the PDF, and name and SHA-256 of the analysed file."""
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256

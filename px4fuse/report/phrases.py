@@ -39,7 +39,6 @@ RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def format_settings(settings: Settings) -> str:
-    """Format SIGMA_A, SIGMA_Z, DT, input and time offset of KF on one line."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     return (
         f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
@@ -80,7 +79,7 @@ def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
-    """Return a table row for each axis and filter: mean NIS, 95 % band, verdict, extra cells."""
+    """Return a table row for each axis and filter, ending with the extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
@@ -109,10 +108,7 @@ def verdict_rows(
 
 
 def write_errors(page: Page, analysis: Analysis) -> None:
-    """Write the table of verdicts and position errors of all axes, main axis first.
-
-    RMS differences KF - EKF2 and RMSE against ground truth are columns if the log contains them.
-    """
+    """Write the table of verdicts and position errors of all axes."""
     axes = (analysis.main, *analysis.secondary_axes)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
@@ -135,11 +131,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return notes against misreading the verdicts on σ.
-
-    They concern a source that may drift, deviations too small for a finding, and innovations that
-    are consistent but not white.
-    """
+    """Return notes on the limits of the verdicts on σ."""
     consistencies = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
@@ -168,7 +160,6 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 
 
 def format_clock_map(clock: ClockMap) -> str:
-    """Format the mapping of a clock to the autopilot's boot clock."""
     is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
     if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
@@ -180,7 +171,7 @@ def format_clock_map(clock: ClockMap) -> str:
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
-    """Format the alignment of a position file with the flight, by label."""
+    """Describe the alignment of a position file with the flight; labels are the keys."""
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
@@ -202,10 +193,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return the recommended actions after noise estimation, by label.
-
-    Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
-    """
+    """Return the recommended actions after noise estimation, with their labels as keys."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
     tuning = tuning_by_axis.get(axis)
@@ -270,12 +258,10 @@ def tuning_advice(
 
 
 def student_line(student: Student, separator: str) -> str:
-    """Join the name and the id of the student."""
     return separator.join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    """Write all findings, each followed by its consequences."""
     if not findings:
         page.write("None.")
     for findings_of_cause in group_by_root(findings):
@@ -283,7 +269,6 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
-    """Write one finding and its consequences."""
     finding, *consequences = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
@@ -301,7 +286,7 @@ def write_finding(page: Page, group: list[Finding]) -> None:
 
 
 def format_noise_estimate(noise: Noise) -> str:
-    """Format a maximum-likelihood noise and its 95 % interval, without the unit."""
+    """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
         bounds = (("at most", noise.high), ("at least", noise.low))
         texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)

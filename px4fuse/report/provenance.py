@@ -27,7 +27,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain_texts=clocks)
     _write_section(
         page,
-        f"Time offset of {source.name} (against the IMU)",
+        f"Time offset between {source.name} and the IMU",
         plain_texts=[clock.summary_line(analysis, results.findings)],
     )
     if alignment is not None:
@@ -58,10 +58,6 @@ def _findings_page(results: ComparisonResults | AidsResults) -> Page:
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """Write log, position source and parameters.
-
-    Names and SHA-256 of the files are last, so that they are on the last page.
-    """
     log, facts = flight.log, dict[str, str]()
     other_positions = (
         f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source
@@ -95,8 +91,7 @@ def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None
         )
         for missing_data in unavailable_parts
     ]
-    none = [] if missing else ["none"]
-    _write_section(page, "Missing data", missing, none)
+    _write_section(page, "Missing data", missing, [] if missing else ["none"])
 
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
@@ -140,7 +135,6 @@ def _write_section(
     labelled_texts: Iterable[tuple[str, str]] = (),
     plain_texts: Iterable[str] = (),
 ) -> None:
-    """Write a heading and texts in small print; nothing without texts."""
     labelled_texts, plain_texts = list(labelled_texts), list(plain_texts)
     if labelled_texts or plain_texts:
         page.heading(title)

@@ -1,10 +1,4 @@
-"""Output on the terminal: text wraps with a hanging indent and is never cut.
-
-In a pipe each paragraph is one line, so other programs can search it.
-
-Texts contain no paths: an action is written ``px4fuse compare LOG --sigma-z 0.2``. The terminal
-prints the command with the path and the options that the user typed.
-"""
+"""Output of pages on the terminal; in a pipe each paragraph is one line."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +25,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Encodings of terminals that can print all characters of a card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Function that yields lines of a card, by kind of block on the page
+# Function that yields the lines of each kind of block
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
 INDENT = 9  # number of characters of a label
 COLUMN_POINTS = 6.0  # indent in the PDF (points) for one character on the terminal
@@ -50,12 +44,7 @@ _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
     """Print texts, tables and cards of a page on the terminal.
 
-    Parameters
-    ----------
-    console : Console
-    blocks : iterable of Block
-    request : Request, optional
-        Request of the user; with it, commands in labelled texts are printed ready to run.
+    With ``request``, commands in texts are printed with the log and the options of the user.
     """
     for block in blocks:
         match block["kind"]:
@@ -107,16 +96,8 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
 
 
 def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Shorten the commands in a text to their options; return the text and the complete commands.
+    """Return a text with its commands shortened to their options, and the complete commands.
 
-    Parameters
-    ----------
-    text : str
-    request : Request
-        Request of the user; its files and options precede those of the command.
-
-    Examples
-    --------
     >>> request = ComparisonRequest(log="a b.ulg")
     >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
@@ -139,18 +120,7 @@ def _styled_text(block: Block) -> Text:
 def print_paragraph(
     console: Console, text: str | Text, head: str | Text = "", indent: int = 0
 ) -> None:
-    """Print a paragraph that wraps with a hanging indent.
-
-    Parameters
-    ----------
-    console : Console
-    text : str or Text
-        Wrapped at the width of the terminal.
-    head : str or Text
-        Label before the first line.
-    indent : int
-        Columns before the other lines, and minimum width of the head.
-    """
+    """Print a paragraph that wraps beside its label (``head``), indented by ``indent`` columns."""
     body = Text(text) if isinstance(text, str) else text
     head = Text(head) if isinstance(head, str) else head.copy()
     head.pad_right(max(indent - head.cell_len, 0))

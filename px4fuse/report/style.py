@@ -1,7 +1,6 @@
 """Colours, lines and matplotlib settings of all plots.
 
-KF is dark, solid and round, EKF2 lighter, dashed and square, so they remain distinct in grey. Text
-from outside (names, notes) is drawn literally, without mathematics or markup.
+KF is dark, solid and round, EKF2 lighter, dashed and square, so they remain distinct in grey.
 """
 
 from __future__ import annotations
@@ -46,12 +45,11 @@ CONSISTENT_BAND_COLOUR = "#d5dfd8"
 
 
 def line_style(colour: str, width: float, dashes: object = "-") -> dict[str, Any]:
-    """Return the matplotlib options of a line."""
     return {"color": colour, "lw": width, "ls": dashes}
 
 
 def dot_style(colour: str, marker: str | int, size: float, edge: float = 0.0) -> dict[str, Any]:
-    """Return the matplotlib options of markers without a line; size and edge width in points."""
+    """Return the matplotlib options of markers; size and edge width in points."""
     return {"color": colour, "marker": marker, "ms": size, "mew": edge, "ls": "none"}
 
 
@@ -84,7 +82,7 @@ def report_style() -> Iterator[None]:
 
 
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
-    """Draw a time series, reduced to MAX_POINTS or, in narrow axes, MAX_POINTS_NARROW points."""
+    """Draw a time series with a limited number of points."""
     axes.plot(
         *decimate_series(
             values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)
@@ -132,7 +130,6 @@ def set_plain_ticks(axis: Axis) -> None:
 
 
 def label_time_axis(axes: Axes, with_time_label: bool) -> None:
-    """Label the time axis, or hide its tick labels if a plot below has them."""
     if with_time_label:
         axes.set_xlabel(TIME_LABEL)
     else:

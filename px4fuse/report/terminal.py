@@ -8,7 +8,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
-from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
+from px4fuse.report.aids import outdoor_aids, write_aids, write_aids_only
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
@@ -33,16 +33,9 @@ def summary(
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal page of `px4fuse compare`.
+    """Make the terminal page of `px4fuse compare`: the diagnosis card.
 
-    Parameters
-    ----------
-    analysis : Analysis or AidsOnlyAnalysis
-    results : ComparisonResults or AidsResults
-    verbose : bool
-        Add the table of axes, the settings and all findings with their consequences.
-    quiet : bool
-        Print the headline only.
+    ``quiet`` prints only its headline; ``verbose`` adds settings, table of axes and findings.
     """
     page = card_page("headline" if quiet else "card", results.card)
     if not verbose:
@@ -56,27 +49,27 @@ def summary(
 
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     page.add("blank")
-    page.write_labelled_texts(facts(analysis))
+    page.write_labelled_texts(_describe_setup(analysis))
     write_errors(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED_COLOUR)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)
-    write_aids_of_comparison(page, analysis)
+    if aids := outdoor_aids(analysis):
+        write_aids(page, aids)
     for group in group_by_root(results.findings):
         write_finding(page, group)
 
 
-def card_page(part: str, card: Card) -> Page:
-    """Make a page with a diagnosis card, its headline, or its closing lines."""
+def card_page(block_kind: str, card: Card) -> Page:
+    """Make a page with the "card", its "headline" or its "closing" lines."""
     page = Page()
-    page.add(part, card=card)
+    page.add(block_kind, card=card)
     return page
 
 
-def facts(comparison: Comparison) -> dict[str, str]:
-    """Return filter settings, position source, alignment and segment, by label."""
+def _describe_setup(comparison: Comparison) -> dict[str, str]:
     source, segment = comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "

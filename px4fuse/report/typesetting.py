@@ -1,7 +1,4 @@
-"""Typesetting of pages by Typst, which can read no other files.
-
-The root of Typst is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
-"""
+"""Typesetting of pages by Typst, which can read no files except fonts."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,13 +16,7 @@ TEMPLATES = ("cover.typ", "report.typ")
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
-    """Typeset data as PDF, by default with the templates of the report.
-
-    Raises
-    ------
-    typst.TypstError
-        The template has an error or reads a file.
-    """
+    """Typeset data as PDF, by default with the templates of the report."""
     with TemporaryDirectory() as empty:
         document = _compiler(report, template, empty).compile(format="pdf", pdf_standards=STANDARDS)
     assert isinstance(document, bytes)
@@ -33,14 +24,7 @@ def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
-    """Typeset a cover without plots and return the height (points) below the card.
-
-    Parameters
-    ----------
-    blocks : sequence of Block
-        Blocks as :func:`px4fuse.report.page.to_typst_data` returns them.
-    font_names : sequence of str
-    """
+    """Typeset a cover without plots, and return the free height (points) below the card."""
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty:

@@ -1,4 +1,4 @@
-"""Terminal page of ``px4fuse whatif``: logged, replayed and changed EKF2, and the sweep."""
+"""Terminal page of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters."""
 
 import math
 
@@ -22,7 +22,6 @@ NOT_PREDICTABLE = "not predictable"
 
 
 def column_heads(analysis: WhatIfAnalysis) -> list[str]:
-    """Return the headings of the columns: EKF2 logged, replayed, replayed with changes."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -40,7 +39,7 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
 
 
 def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return a row for each EKF2 statistic: label, and values as logged, replayed and changed."""
+    """Return a row for each statistic of EKF2: as logged, replayed, and replayed with changes."""
     result = analysis.whatif
     labels = _statistics(result.replayed, result.replayed)
     columns = [
@@ -53,7 +52,6 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
-    """Format the statistics of EKF2, by label; heading and height only if ``replayed`` has them."""
     texts = dict[str, str]()
     for name, axis in summary.axes.items():
         texts |= _nis_texts(name, axis) | {
@@ -90,7 +88,7 @@ def _fusion_texts(summary: Summary) -> dict[str, str]:
 
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return the column headings, and a row of EKF2 statistics per value of the swept parameter."""
+    """Return the headings, and a row of statistics for each value of the swept parameter."""
     name, rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
     for summary in sweep_summaries(analysis):
@@ -117,18 +115,16 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
 
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
-    """Return the statistics of EKF2 replayed with each value of the swept parameter."""
     return analysis.whatif.whatif[analysis.sweep_start :]
 
 
 def swept_parameter(analysis: WhatIfAnalysis) -> str:
-    """Return the name of the swept parameter."""
     (name,) = sweep_summaries(analysis)[0].changed.keys() - analysis.changes.keys()
     return name
 
 
 def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
-    """Return sentences on the best value of the swept parameter and on the limits of the replay."""
+    """Return sentences on the best value of the swept parameter."""
     sentences = []
     if summaries := [summary for summary in sweep_summaries(analysis) if summary.is_predictable]:
         name = swept_parameter(analysis)
@@ -152,8 +148,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
         sentences.append(
             f"Not predictable: more than {MAX_REJECTED_FRACTION:.0%} of the samples would "
             f"be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would change "
-            f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. The "
-            "statistics then depend on the rejection of single samples."
+            f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 
@@ -174,8 +169,8 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         text = (
-            "This log does not show a noise or a delay that fits better than EKF2's parameters, so "
-            "nothing is changed. Test another value with --set NAME=VALUE."
+            "No other noise or delay fits this log better than EKF2's parameters, so nothing is "
+            "changed. Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", text)
     head = ["", *column_heads(analysis)]

@@ -380,9 +380,9 @@ def _move_to_reference_body(
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
-    arm_m, moved = np.zeros(3), estimate
+    arm_m, corrected = np.zeros(3), estimate
     for _ in range(ITERATIONS):
-        transform = fit_alignment(moved.position_m, reference.position_m, alignment)
+        transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
         body = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
@@ -391,7 +391,7 @@ def _move_to_reference_body(
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
         arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
         shift_m = (estimate.rotation * body).apply(arm_m) / transform.scale
-        moved = replace(
+        corrected = replace(
             estimate,
             position_m=estimate.position_m - shift_m,
             rotation=estimate.rotation * body,
@@ -399,7 +399,7 @@ def _move_to_reference_body(
     components = ", ".join(
         f"{value:+.2f} m along {axis}" for value, axis in zip(arm_m, "xyz", strict=True)
     )
-    return moved, (
+    return corrected, (
         f"The orientations differ by a constant {np.degrees(body.magnitude()):.1f}°: the estimate "
         "has other body axes than the reference, for example those of a camera. Its origin is at "
         f"{components} of the reference body. Both are corrected before the errors are computed.",

@@ -315,18 +315,22 @@ def rmse_interval(
             f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
-    sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
+    cumulative_squares = np.concatenate(
+        ([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1]))))
+    )
     block_means = (
-        sums[length:] - sums[:-length]
+        cumulative_squares[length:] - cumulative_squares[:-length]
     ) / length  # mean squared error of each circular block
     block_count = n / length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
         0, n, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
-    means = block_means[block_starts].mean(axis=1)
+    resampled_means = block_means[block_starts].mean(axis=1)
     quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
-    tail = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
-    low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
+    tail_probability = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
+    low, high = np.sqrt(
+        np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
+    )
     return Interval(float(low), float(high), length, block_count)
 
 

@@ -321,12 +321,12 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
         return float("inf")
     score = (velocities[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
     # The window of the weights must be longer than the correlation
-    lags = min(max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), n // 4)
-    weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
-    products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
+    lag_count = min(max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), n // 4)
+    weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
+    products = [float(score[k:] @ score[:-k]) for k in range(1, lag_count + 1)]
     own_variance = float(score @ score)
     variance = max(own_variance + 2.0 * float(weights @ products), own_variance)
-    quantile = float(stdtrit(max(n / lags - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
+    quantile = float(stdtrit(max(n / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
     return float(quantile * np.sqrt(variance) / information)
 
 

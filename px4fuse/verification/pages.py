@@ -75,15 +75,15 @@ MAX_XMP_BYTES = 100_000
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
-    "/AA": "an action that a viewer runs automatically",
+    "/AA": "an action that runs automatically",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
     "/CropBox": "a crop box",
     "/OCProperties": "layers",
-    "/OpenAction": "an action that a viewer runs automatically",
+    "/OpenAction": "an action that runs automatically",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "another unit of length for a page",
+    "/UserUnit": "a unit of length other than the point",
     "/XObject": "an image or form object",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
@@ -257,7 +257,7 @@ class _PdfComparison:
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
             description = f"{feature} is missing"
             if name in submitted_keys:
-                description = f"the PDF contains {feature} that px4fuse does not write"
+                description = f"the PDF contains {feature}, which px4fuse does not write"
             yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name

@@ -263,7 +263,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     given = parser.parse_args()
-    names = [*COMMANDS]
+    names = [name for name in COMMANDS if name != "mcp"]  # a server uses standard input
     # commands with many options are drawn more often
     weights = [2 + len(cli.get_command(click.Context(cli), name).params) for name in names]  # type: ignore[union-attr]
     counts: dict[str, Counter[str]] = {name: Counter() for name in COMMANDS}

@@ -51,7 +51,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
         html_above=_above_html(entries, counts),
-        noun=("student", "students"),
+        row_nouns=("student", "students"),
         columns=(
             Column("Student"),
             Column("Id", "line", visible_from="tablet"),
