@@ -1,7 +1,5 @@
 """Records of an analysis: :mod:`px4fuse.diagnose` computes them from a request."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -54,8 +52,8 @@ class Analysis(Comparison, Estimates, Reruns):
     @property
     def main_trials(self) -> list[Trial]:
         """Re-runs along the main axis; of EKF2 only if its replay agrees with the log."""
-        main = self.main.axis.name
-        return [trial for trial in self.trials if trial.axis == main and trial.is_logged]
+        main_axis = self.main.axis.name
+        return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
     @property
     def secondary_axes(self) -> list[AxisComparison]:

@@ -9,8 +9,6 @@
 7. find: faults of the flight, with their causes
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -148,9 +146,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     LogError, MissingDataError, SettingsError
         A file cannot be read, or does not belong to the flight.
     """
-    log = Path(request.log)
-    progress(f"reading {display_name(log)}")
-    flight = read_log(log, system=request.system)
+    log_path = Path(request.log)
+    progress(f"reading {display_name(log_path)}")
+    flight = read_log(log_path, system=request.system)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
@@ -293,7 +291,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # only the default change needs the estimates of a comparison
+    except MissingDataError:  # given changes need no estimates
         if is_default_change:
             raise
     if comparison is not None:

@@ -10,9 +10,8 @@
     ├── ResultsError       a file contains no results of px4fuse that this version reads
     └── OutputError        a result cannot be written
 
-The text is one line: the fault, its place, and an action. Arguments are in backticks
-(`sigma_z_m`); the command line replaces them by its options
-(:func:`px4fuse.request.with_options`), prints the text to standard error and ends with exit code 2.
+The text is one line: the fault, its place, and an action. The command line replaces arguments in
+backticks (`sigma_z_m`) by its options, and ends with exit code 2.
 """
 
 from collections.abc import Iterable

@@ -59,12 +59,12 @@ def kalman_lines() -> Iterator[str]:
 def loop_lines() -> Iterator[str]:
     """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
     odometry = np.array(ODOMETRY_M)
-    misclosure = odometry[-1] - odometry[0]
-    total = cumulative_distance(odometry)[-1]
+    length_m = cumulative_distance(odometry)[-1]
+    x_error_m, y_error_m = closure_error_m = odometry[-1] - odometry[0]
     yield (
-        f"loop closure error ({misclosure[0]:.1f}, {misclosure[1]:.1f}) m over {total:.1f} m = "
-        f"{np.hypot(*misclosure) / total:.1%}"
+        f"loop closure error ({x_error_m:.1f}, {y_error_m:.1f}) m over {length_m:.1f} m = "
+        f"{np.hypot(x_error_m, y_error_m) / length_m:.1%}"
     )
-    corrected_path = distribute_by_distance(odometry, misclosure)
+    corrected_path = distribute_by_distance(odometry, closure_error_m)
     for (x, y), (x_corrected, y_corrected) in zip(odometry, corrected_path, strict=True):
         yield f"({x:5.1f}, {y:5.1f}) -> ({x_corrected:5.2f}, {y_corrected:5.2f})"

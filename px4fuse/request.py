@@ -331,10 +331,13 @@ def command_line(
     """
     shown_request = request if for_shell else request.without_paths()
     # required fields of a request are input files, and all other fields are options
-    required_names = [
-        field.name for field in msgspec.structs.fields(shown_request) if field.required
+    files = [
+        getattr(shown_request, field.name)
+        for field in msgspec.structs.fields(shown_request)
+        if field.required
     ]
-    files = [_path_argument(getattr(shown_request, name)) for name in required_names]
+    # a path that begins with "-" would be read as an option
+    files = [f"./{path}" if path.startswith("-") else path for path in files]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
     arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
     if isinstance(shown_request, WhatIfRequest):
@@ -368,11 +371,6 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
         text = PurePath(value).stem if option == "--position" and value is not None else value
         name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
-
-
-def _path_argument(path: str) -> str:
-    # the prefix ./ prevents that a path that begins with "-" is read as an option
-    return f"./{path}" if path.startswith("-") else path
 
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:

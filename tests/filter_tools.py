@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.core.arrays import Array
+from px4fuse.filter.likelihood import Preintegrated
+from px4fuse.filter.model import INITIAL_COVARIANCE, propagate_covariance, update_step
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_axes
 from px4fuse.flight.model import Columns, Flight
@@ -147,3 +149,30 @@ def imu_table(time: Array, force: Array, rate: Array) -> pd.DataFrame:
 
 def attitude_table(time: Array, turn: Rotation) -> pd.DataFrame:
     return table(time, turn.as_quat(scalar_first=True), Columns.QUATERNION)
+
+
+def score_grid(
+    intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
+) -> Array:
+    """Return KF's -ln p of all axes (without a constant) on a grid of settings.
+
+    The variance of a measurement is SIGMA_Z² / weight.
+    """
+    q, r = np.broadcast_arrays(np.square(sigma_a_m_s2), np.square(sigma_z_m))
+    total = np.zeros(q.shape)
+    for axis in intervals:
+        p, v = axis.initial.position_m, axis.initial.velocity_m_s + 0.0 * q
+        covariance = INITIAL_COVARIANCE
+        for k, z in enumerate(axis.measurement_m):
+            p = p + axis.length_s[k] * v + axis.delta_position_m[k]
+            v = v + axis.delta_velocity_m_s[k]
+            covariance = tuple(
+                p_ij + q * unit + fixed
+                for p_ij, unit, fixed in zip(
+                    propagate_covariance(covariance, axis.length_s[k]),
+                    axis.noise_unit[k], axis.noise_fixed[k], strict=True,
+                )
+            )  # fmt: skip
+            (nu, s, _, _), (p, v, covariance) = update_step(p, v, covariance, z, r / weight[k])
+            total += 0.5 * (np.log(s) + nu**2 / s)
+    return total

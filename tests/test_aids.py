@@ -191,7 +191,7 @@ def test_aiding_source_findings_state_sensor_and_times() -> None:
         ((9.9,), None, ("note", "EKF2 fused no sample of the barometer for 21 s")),
         ((10.1,), None, None),  # usual: the ground disturbs the pressure
         ((), 0.8, ("warning",
-                   "EKF2 fused no sample of the barometer for 21 s, with a height error of "
+                   "EKF2 fused no sample of the barometer for 21 s: EKF2's height error is "
                    "0.80 m")),
     ],
 )  # fmt: skip

@@ -13,14 +13,15 @@ from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
+    CONSTANT_INNOVATIONS,
     VELOCITY_UPDATE_COLUMNS,
     Agreement,
     AxisAgreement,
     Ekf2Replay,
     _agreement_verdict,
     _axis_agreement,
+    _compare_velocity,
     _heading_error_deg,
-    _velocity_agreement,
     agreement_with_log,
     inside_spans,
     logged_innovations,
@@ -166,7 +167,7 @@ def test_constant_velocity_innovations_have_no_correlation():
     samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
     ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
     replay = SimpleNamespace(updates=updates, evaluated_s=((0.0, 99.0),), other_aid_updates={})
-    assert _velocity_agreement(ekf2, replay, is_own_topic=True) == ({}, True)
+    assert _compare_velocity(ekf2, replay, is_own_topic=True) == CONSTANT_INNOVATIONS
 
 
 def test_heading_error_without_logged_state_is_none():

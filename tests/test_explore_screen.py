@@ -310,6 +310,6 @@ def test_explore_page_has_no_serious_accessibility_violation(
     browser.scheme(scheme)
     browser.ask(axe())
     assert browser.ask("document.documentElement.scrollWidth") <= width
-    for view in ("errors", "track", "step", "map", "statistics"):
+    for view in ("errors", "track", "step", "statistics"):
         open_view(browser, view)
         assert serious(browser) == [], view

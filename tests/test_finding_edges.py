@@ -62,7 +62,12 @@ from px4fuse.findings import (
     source_stamps,
 )
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
-from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
+from px4fuse.findings.model import (
+    SOURCE_WORDS,
+    fraction_on,
+    spans_with_value,
+    zero_length_spans,
+)
 from px4fuse.flight.log import ClockMap, Dropout
 from px4fuse.flight.model import Columns, Reset, Unavailable
 from px4fuse.flight.position_source import (
@@ -295,7 +300,8 @@ def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
 
 
 CHECK_FIRST = (
-    "Check line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+    "Check the data link and the line of sight to the anchors. Then check EKF2_EV_DELAY and "
+    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE last."
 )
 
 
@@ -313,12 +319,27 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
     main = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
     assert main.evidence["filter"] == "kf"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
-    assert finding.remedy == hidden_errors.SHARED_REMEDY
+    assert finding.remedy == (
+        "Check the time offset of the positions (px4fuse sync LOG). "
+        f"Then check {SOURCE_WORDS['uwb'].errors}."
+    )
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
         (0.27, hidden_errors.EKF2_REMEDY),
-        (0.28, hidden_errors.SHARED_REMEDY),
-        (0.4, hidden_errors.SHARED_REMEDY),
+        (
+            0.28,
+            (
+                "Check the time offset of the positions (px4fuse sync LOG). "
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
+            ),
+        ),
+        (
+            0.4,
+            (
+                "Check the time offset of the positions (px4fuse sync LOG). "
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
+            ),
+        ),
     ):
         just = axis("east", kf=statement(2.0), kf_truth=against_truth(25.0, kf_rmse_m),
                     ekf2=statement(0.5), ekf2_truth=against_truth(25.0))  # fmt: skip
@@ -864,7 +885,7 @@ def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
-        assert "± 2 %, 95 %" in finding.message
+        assert "± 2 % (95 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"

@@ -506,7 +506,7 @@ def test_what_if_with_unused_parameter_raises_settings_error(models):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received, uses_sender_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
-    with pytest.raises(SettingsError, match="EKF2_GPS_DELAY has no effect in this log"):
+    with pytest.raises(SettingsError, match="EKF2_GPS_DELAY has no effect in a replay of this log"):
         what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
 
 

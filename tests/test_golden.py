@@ -10,9 +10,12 @@ writes them again. Review the differences and the pages before committing.
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shlex
 import shutil
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ from artificial_batch import artificial_logs
 from browser import content
 from class_tools import in_this_process
 from cli_tools import run
-from conftest import REPOSITORY, blank_page
+from conftest import REPOSITORY, SAMPLES, blank_page
 from golden_tools import assert_matches_golden, numbers, of_blocks, of_values, rounded, written
 from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
@@ -30,6 +33,7 @@ from ulog_tools import gnss_log
 import px4fuse
 from px4fuse.batch.page import html_text
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
+from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.core.text import to_json_types
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
@@ -166,6 +170,26 @@ def test_command_output_matches_reference_file(
     assert_matches_golden(name, [re.sub(again, "the log gives it again", line) for line in lines])
 
 
+@pytest.mark.usefixtures("cached_analyses")
+def test_session_in_page_on_assistants_has_current_answers() -> None:
+    """The page contains calls of the tools of `px4fuse mcp`, each followed by its answer."""
+    page = REPOSITORY / "docs" / "assistants.md"
+    parsers = {tool.name: parse for tool, parse in make_tools((SAMPLES,))}
+
+    def with_answer(call: re.Match[str]) -> str:
+        words, _ = parsers[call[1]](json.loads(call[2]))
+        answer, _ = copy_context().run(run_command, (SAMPLES,), 10**9, None, None, words)
+        lines = [line.rstrip() for line in answer.strip().splitlines()]
+        return "\n".join([f"> {call[1]} {call[2]}", *lines, "```"])
+
+    text = page.read_text(encoding="utf-8")
+    current, count = re.subn(r"^> (\w+) (\{.*?\})\n.*?^```$", with_answer, text, flags=re.M | re.S)
+    if os.environ.get("PX4FUSE_GOLDEN") == "write":
+        page.write_text(current, encoding="utf-8")
+    assert page.read_text(encoding="utf-8") == current
+    assert count == 2
+
+
 def spread(kind: str, *mistakes: str) -> list[str]:
     """Summarise the fields of a simulated flight's topics, and its answer key."""
     size = {} if kind == "outdoor" else {"length_m": 6.0}
@@ -223,7 +247,7 @@ def test_batch_page_matches_reference_file() -> None:
 def test_explore_page_plots_match_reference_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
-    document, _ = document_json(data, analysis)
+    document, _ = document_json(data)
     ids: dict[str, str] = {}
 
     def number_bokeh_ids(found: re.Match[str]) -> str:

@@ -262,7 +262,7 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
     assert HEIGHT_LOGGED_NOTE in found.notes
-    with pytest.raises(SettingsError, match=r"effect of EKF2_BARO_NOISE cannot .*barometer: "):
+    with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE has no effect .*barometer: "):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
     with pytest.raises(SettingsError, match=r"baro_hgt cannot be omitted: .*barometer: "):
         what_if(model, [{}], {"baro_hgt": 40.0})

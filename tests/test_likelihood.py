@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from exchange import replace
-from filter_tools import any_axis, any_settings, sample_axes
+from filter_tools import any_axis, any_settings, sample_axes, score_grid
 from flights import line, random_walk
 from hypothesis import given, settings
 from numpy.typing import NDArray
@@ -14,8 +14,6 @@ from px4fuse.filter.likelihood import (
     innovations,
     parabola_vertex,
     preintegrate,
-    run_filter,
-    score_grid,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -39,13 +37,11 @@ def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
 
 def test_fast_kf_on_noise_grid_equals_kf_replay(sample_flight: Flight) -> None:
     for axis in sample_axes(sample_flight):
-        nu, s = innovations(
-            preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z)
-        )
+        intervals = preintegrate(axis, Settings())
         for i, sigma_a in enumerate(SIGMA_A):
             for j in range(3) if axis.name == "north" else [i]:
                 chosen = Settings(sigma_a_m_s2=sigma_a, sigma_z_m=SIGMA_Z[j])
-                found = np.array([nu[:, i, j], s[:, i, j]])
+                found = innovations(intervals, sigma_a, SIGMA_Z[j])
                 np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
 
@@ -78,19 +74,6 @@ def test_fast_kf_does_not_fuse_skipped_measurement() -> None:
     np.testing.assert_allclose([nu[~skip], s[~skip]], expected, rtol=1e-9, atol=1e-9)
     assert np.all(s[skip] > 0.0)
     assert np.all(nu[skip] != 0.0)
-
-
-def test_fast_kf_weight_divides_measurement_variance() -> None:
-    """A weight of 1/w² multiplies SIGMA_Z by w; a weight near zero excludes the measurement."""
-    legs = preintegrate(walk(count=40), ZERO)
-    rows = list(run_filter(legs, 0.5, 0.2, None, np.full(39, 4.0)))
-    heavier = innovations(legs, 0.5, 0.1)
-    np.testing.assert_allclose([row[:2] for row in rows], np.transpose(heavier), rtol=1e-12)
-    skip = np.arange(39) % 7 == 3
-    left_out = list(run_filter(legs, 0.5, 0.1, None, np.where(skip, 1e-14, 1.0)))
-    nu, s = innovations(legs, 0.5, 0.1, skip)
-    np.testing.assert_allclose([row[0] for row in left_out], nu, rtol=1e-6)
-    np.testing.assert_allclose(np.array([row[1] for row in left_out])[~skip], s[~skip], rtol=1e-6)
 
 
 def test_likelihood_grid_of_noises_equals_normal_density() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exchange import replace
-from filter_tools import TRUE, modelled
+from filter_tools import TRUE, modelled, score_grid
 from flights import line, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,7 +34,6 @@ from px4fuse.filter.likelihood import (
     innovations,
     preintegrate,
     profile_ends,
-    score_grid,
 )
 from px4fuse.filter.marginal_likelihood import (
     Positions,
@@ -42,7 +41,6 @@ from px4fuse.filter.marginal_likelihood import (
     expected_squares,
     factorise,
     fit_positions,
-    products_by_segment,
 )
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.settings import Settings
@@ -278,28 +276,6 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_products_with_banded_covariance_equal_dense_products() -> None:
-    part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
-    signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
-    still = np.zeros((3, 2, COUNT - 1))
-    first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
-    given = arguments(part, noises, np.ones(COUNT))
-    found_values = products_by_segment(*given, (first, still, still), second)
-    # a path that agrees with the increments has no effect
-    legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
-    path, speed = np.zeros((2, *first.shape))
-    for at in np.flatnonzero(part.is_joined):
-        path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
-        speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
-    moved = products_by_segment(*given, (first + path, *legs), second)
-    np.testing.assert_allclose(moved, found_values, rtol=1e-3, atol=1e-3)
-    for stretch in range(2):
-        _, covariance, made = joint_normal(part, noises, given[2], stretch)
-        picked = np.concatenate([signal[rows, axis] for axis, (rows, *_) in enumerate(made)])
-        expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(found_values[stretch], expected[1], rtol=1e-4, atol=1e-4)
-
-
 def test_subtracting_imu_path_from_positions_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
@@ -360,9 +336,9 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
     legs = preintegrate(axis, chosen)
     pairs = [(0.5, 0.1), (0.05, 0.1), (3.0, 0.1), (0.5, 0.01), (0.5, 1.0), (0.02, 2.0)]
     a, z = np.transpose(pairs)
-    nu, s = innovations(legs, a, z)
-    weight = np.ones(len(nu))
-    expected = 0.5 * np.sum(np.log(s) + nu**2 / s, axis=0)
+    scores = [np.log(s) + nu**2 / s for nu, s in (innovations(legs, *pair) for pair in pairs)]
+    expected = 0.5 * np.sum(scores, axis=1)
+    weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
     part = [filter_positions(legs)]
@@ -373,7 +349,7 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
         found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
     )
     # weights have the same meaning in both
-    weight = np.random.default_rng(1).uniform(0.01, 1.0, len(nu))
+    weight = np.random.default_rng(1).uniform(0.01, 1.0, len(weight))
     grid = score_grid([legs], a, z, weight)
     found_values = np.array(
         [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]

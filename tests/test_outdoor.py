@@ -221,7 +221,7 @@ def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path)
     assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
-    with pytest.raises(SettingsError, match="does not contain all fused magnetometer samples"):
+    with pytest.raises(SettingsError, match="the log lacks some fused magnetometer samples"):
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])
 
 

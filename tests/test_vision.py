@@ -520,7 +520,7 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     assert not found.agreement.good
     assert found.inputs.vision is None
     assert "ev_pos" not in modelled_aids(found.inputs)
-    with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in this log"):
+    with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
         replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
 
 

@@ -1,16 +1,11 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-The computer of a UWB system records with a separate clock and frame. The track of the file is
-matched with a reference in the log:
+The computer of a UWB system has a separate clock and frame. The track of the file is matched with
+EKF2's position or, if this is not suitable, with the acceleration integrated twice. The time offset
+is found by cross-correlation at all lags, and refined by robust least squares. It is relative to
+the reference: if EKF2 fused late positions, it includes their delay.
 
-1. EKF2's position;
-2. if EKF2's position is not suitable, the acceleration of the IMU integrated twice. Both tracks are
-   then band-pass filtered.
-
-Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
-The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
-refined by robust least squares. The time offset is relative to the reference: if EKF2 fused late
-positions, EKF2's position is late, and the time offset includes this delay.
+Horizontal positions are complex numbers, north + i·east: a rotation in yaw is a factor e^{i·yaw}.
 """
 
 from collections.abc import Iterator
@@ -42,6 +37,8 @@ MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
+# Minimum rotation (°) of the frame of a position file to be named
+MIN_NAMED_YAW_DEG = 1.0
 
 
 def align_position_file(
@@ -281,10 +278,10 @@ def _compare_with_ekf2(
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
-    power = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
-    if power == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
+    norm_product = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m)) / power
+    return distance_m, float(np.sum(file_m * ekf2_m)) / norm_product
 
 
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
@@ -302,10 +299,12 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    return (
+    rotation_text = (
         f"The frame of the position file is rotated by {yaw_deg:.1f}° against the {name}. "
-        f"{shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
+    if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG:
+        rotation_text = ""
+    return f"{rotation_text}{shift_text}Give --position-yaw auto to estimate yaw and origin."
 
 
 def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:

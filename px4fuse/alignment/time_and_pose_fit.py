@@ -151,11 +151,8 @@ def fit_by_least_squares(
 ) -> Fit:
     """Fit the file to the reference by robust least squares (soft L1).
 
-    1. The origin is always fitted. Otherwise a position offset of the file would be mistaken for a
-       lag if the vehicle flies mostly in one direction.
-    2. The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None.
-    3. The covariance is σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual. It is multiplied
-       by 1 + 2Σρ for autocorrelated residuals (sum to the first zero of ρ).
+    The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None. The origin is always
+    fitted: on a flight in one direction, an offset of the origin would look like a lag.
 
     Raises
     ------
@@ -175,8 +172,10 @@ def fit_by_least_squares(
     centre_m = np.mean(file_m)
     # with a centred track, the errors of yaw and origin are uncorrelated
     file_m = file_m - centre_m
-    power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
-    coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
+    std_product = float(np.sqrt(np.var(file_m) * np.var(target_m)))
+    coherence = (
+        complex(np.vdot(file_m, target_m) / len(file_m) / std_product) if std_product > 0 else 0j
+    )
     mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
     horizontal = reference.horizontal_m
 
@@ -224,7 +223,7 @@ def fit_by_least_squares(
     concordance = peak.concordance
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
-        concordance = real_covariance * power / mean_square if power > 0 else 0.0
+        concordance = real_covariance * std_product / mean_square if std_product > 0 else 0.0
     origin = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,

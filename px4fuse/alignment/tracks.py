@@ -123,8 +123,10 @@ def band_pass(position_m: Array) -> Array:
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
     """Mark the transients of the band-pass filter at ends and gaps as invalid."""
-    edge = round(TRANSIENT_S / GRID_STEP_S)
-    return replace(track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, bool)))
+    transient_samples = round(TRANSIENT_S / GRID_STEP_S)
+    return replace(
+        track, is_valid=binary_erosion(track.is_valid, np.ones(2 * transient_samples + 1, bool))
+    )
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
@@ -151,7 +153,11 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError("the log has no EKF2 position")
     state = flight.ekf2.state
     states = [state]
-    resets = [r for r in flight.ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
+    resets = [
+        reset
+        for reset in flight.ekf2.resets
+        if reset.quantity == "position" and any(reset.delta[:2])
+    ]
     if resets:
         is_after_reset = state.index.to_numpy()[:, None] >= [reset.time_s for reset in resets]
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])

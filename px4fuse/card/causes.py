@@ -13,14 +13,14 @@ from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     OUTLIERS,
     Trial,
-    enters_band,
-    halves,
+    becomes_consistent,
+    halves_discrepancy,
     has_effect,
     improvement,
-    leaves_error,
     preference,
     ratios,
     reduction,
+    remains_overconfident,
 )
 from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_ratio
@@ -60,6 +60,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "autopilot_restarted",
     "imu_samples_missing",
     "ekf2_not_fusing",
+    "parameter_changed",
 )
 # Ids of findings that only repeat a verdict on σ; the card lists them only if no other cause exists
 VERDICT_FINDINGS = frozenset(
@@ -89,7 +90,12 @@ TARGETS: Mapping[str, Target] = {
     "logging": "logging",
 }
 # Exceptions to TARGETS, by id of the finding
-TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
+TARGETS_BY_ID: Mapping[str, Target] = {
+    "source_drift": "source",
+    "source_lever_arm": "EKF2",
+    "source_height_only": "EKF2",
+    "ekf2_not_fusing": "sender",
+}
 
 
 class RankedCause(NamedTuple):
@@ -141,11 +147,11 @@ def _is_setting(finding: Finding) -> bool:
 def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
     if finding.id in MEANINGLESS_VERDICT_FINDINGS or CONVENTION in finding.evidence:
         return 0
-    if _is_setting(finding) and any(map(leaves_error, trials)):
+    if _is_setting(finding) and any(map(remains_overconfident, trials)):
         return 3
-    if any(enters_band(trial) for trial in trials):
+    if any(becomes_consistent(trial) for trial in trials):
         return 1
-    if any(halves(trial) for trial in trials):
+    if any(halves_discrepancy(trial) for trial in trials):
         return 2
     return 3 if finding.severity == "error" else 4
 
@@ -362,9 +368,9 @@ def _closing_sentence(
 ) -> str:
     if alternatives:
         return (
-            "Take only one of these actions: both correct the same time offset. Their signs "
-            "differ: --clock-offset (s) is added to the timestamps of this log, the delay "
-            "parameter (ms) is the age of a position."
+            "Take only one of these actions: both correct the same time offset, with opposite "
+            "signs. --clock-offset (s) is added to the timestamps, the delay parameter (ms) is "
+            "the age of a position."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises, and with the estimated noises."

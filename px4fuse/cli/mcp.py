@@ -20,9 +20,9 @@ from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
 from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
 from px4fuse.errors import SettingsError
 
-# Names of arguments of tools that differ from the names of the parameters of commands
+# Name of the argument of a tool, by the name of the command's parameter if the names differ
 ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
-# Parameters of commands that are no arguments of tools: outputs, exit codes and the student
+# Parameters of commands that tools do not have: outputs, exit codes and student
 HIDDEN = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
@@ -142,24 +142,9 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
         "explain": ("explain", None),
         "list_findings": ("explain", None),
     }
-    tools = list[tuple[Any, Any]]()
+    tools = []
     for name, (command_name, kind) in kinds.items():
-        command = cli.get_command(click.Context(cli), command_name)
-        parameters = {
-            ARGUMENT_NAMES.get(parameter.name or "", parameter.name or ""): parameter
-            for parameter in (command.params if command and name != "list_findings" else ())
-            if parameter.expose_value and parameter.name not in HIDDEN
-        }
-        input_schema = {
-            "type": "object",
-            "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
-            "required": [
-                name
-                for name, parameter in parameters.items()
-                if isinstance(parameter, click.Argument)
-            ],
-            "additionalProperties": False,
-        }
+        parameters = {} if name == "list_findings" else _parameters_of(command_name)
         output_schema = None
         if kind is not None:
             schemas, definitions = contract.schema_of_types(get_args(kind) or (kind,))
@@ -167,11 +152,29 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
         tool = Tool(
             name=name,
             description=COMMANDS[command_name] if parameters else "List the ids of all findings.",
-            input_schema=input_schema,
+            input_schema=_input_schema(parameters),
             output_schema=output_schema,
         )
         tools.append((tool, partial(_parse, command_name, parameters, folders)))
     return tools
+
+
+def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
+    """Return the parameters of a command that its tool has, by the name of the argument."""
+    command = cli.get_command(click.Context(cli), command_name)
+    assert command is not None
+    names = {str(one.name): one for one in command.params if one.expose_value}
+    return {ARGUMENT_NAMES.get(name, name): names[name] for name in names if name not in HIDDEN}
+
+
+def _input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
+    operands = [name for name, one in parameters.items() if isinstance(one, click.Argument)]
+    return {
+        "type": "object",
+        "properties": {name: _schema_of(one) for name, one in parameters.items()},
+        "required": operands,
+        "additionalProperties": False,
+    }
 
 
 def _schema_of(parameter: click.Parameter) -> dict[str, Any]:

@@ -75,7 +75,8 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
     In a pipe, or if ``output`` is standard output, the function shows nothing.
     """
-    if (send := click.get_current_context().meta.get(SEND_KEY)) is not None:
+    context = click.get_current_context(silent=True)
+    if context and (send := context.meta.get(SEND_KEY)):
         yield lambda activity, *_: send(activity)
         return
     from rich.console import Console

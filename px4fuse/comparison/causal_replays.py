@@ -4,8 +4,6 @@ KF and EKF2 are re-run with each candidate change (:mod:`px4fuse.comparison.chan
 change makes the filter consistent, the best change is combined with each other one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

@@ -290,7 +290,7 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
         if flight.log.has_ulog:
             remedy = "Give the ULog of this flight as argument LOG."
     return Unavailable(
-        "clock offset",
+        "time offset",
         f"{rate_note}, but an estimate of the time offset needs {needed_hz:g} Hz",
         remedy,
     )
@@ -306,9 +306,9 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
     if len(offset) <= MIN_PARTS:
         return structs.replace(clock, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None)
-    scatter = np.sqrt(max(1.0, _weighted_square_sum(offset, weight) / (len(offset) - 1)))
+    sigma_factor = np.sqrt(max(1.0, _weighted_square_sum(offset, weight) / (len(offset) - 1)))
     low, high = (
-        clock.offset_s + scatter * (limit_s - clock.offset_s) for limit_s in clock.interval_s
+        clock.offset_s + sigma_factor * (limit_s - clock.offset_s) for limit_s in clock.interval_s
     )
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
@@ -319,7 +319,7 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     return structs.replace(
         clock,
         interval_s=(float(low), float(high)),
-        sigma_s=float(clock.sigma_s * scatter),
+        sigma_s=float(clock.sigma_s * sigma_factor),
         is_determinable=not reason,
         reason=reason,
         drift_ppm=None,
@@ -342,12 +342,16 @@ def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)
     smallest_p = 1.0
     for split in split_rows:
-        sides = [(offset[rows], weight[rows]) for rows in (slice(None, split), slice(split, None))]
-        step = float(np.diff([np.average(x, weights=w) for x, w in sides])[0])
+        before_and_after = [
+            (offset[rows], weight[rows]) for rows in (slice(None, split), slice(split, None))
+        ]
+        step = float(np.diff([np.average(x, weights=w) for x, w in before_and_after])[0])
         if abs(step) < MIN_CHANGE_S:
             continue
-        scatter = max(1.0, sum(_weighted_square_sum(x, w) for x, w in sides) / (count - 2))
-        sigma = np.sqrt(scatter * sum(1.0 / np.sum(w) for _, w in sides))
+        variance_factor = max(
+            1.0, sum(_weighted_square_sum(x, w) for x, w in before_and_after) / (count - 2)
+        )
+        sigma = np.sqrt(variance_factor * sum(1.0 / np.sum(w) for _, w in before_and_after))
         p = 2.0 * float(stdtr(count - 2, -abs(step) / sigma))
         smallest_p = min(smallest_p, p * len(split_rows))
     return smallest_p if split_rows else None

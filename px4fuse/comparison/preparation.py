@@ -9,13 +9,14 @@ from msgspec import structs
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct, find_faults
+from px4fuse.convention.correction import correct_convention, find_faults
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
-from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
+from px4fuse.filter.settings import CLOCK_OFFSET_RANGE_S, SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
+    HEIGHT_ONLY,
     Columns,
     Ekf2,
     Flight,
@@ -85,17 +86,17 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s
-    settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
-    flight, track = correct(flight, track, convention)
+    # a time offset beyond the range of the settings is found at the edge of the searched range
+    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *CLOCK_OFFSET_RANGE_S))
+    settings = replace(settings, clock_offset_s=clock_offset_s)
+    flight, track = correct_convention(flight, track, convention)
     track = _move_to_vehicle(track, flight)
     track = _use_origin_of_gnss(track, flight)
     track = _use_barometer_height(track, flight, request.height)
     flight = select_innovations(flight, track)
     missing = flight.missing
     segment = choose_segment(flight, track, request.start_s, request.end_s)
-    names: tuple[str, ...] | None = request.axes or None
-    if names is None and track.origin.fused_as_gnss:
-        names = GNSS_AXES
+    names = request.axes or (GNSS_AXES if track.origin.fused_as_gnss else None)
     lines = make_axes(flight, track, segment, names=names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
@@ -264,6 +265,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damage_text}no external position in this log (no {topics})"
+    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
+    if height_only is not None:
+        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY}"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"

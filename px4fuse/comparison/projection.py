@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
+from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.flight.model import (
@@ -23,8 +24,6 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# EKF2's ratio of GNSS height noise to GNSS position noise, in σ (gnss_height_control.cpp)
-GNSS_HEIGHT_SCALE = 1.5
 # Minimum number of samples that two tracks have in common, for statistics of their difference
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
@@ -56,8 +55,7 @@ def continuous_state(
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
-    kept_resets: list[str] = []
-    removed_resets: list[str] = []
+    removed, kept = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -71,27 +69,23 @@ def continuous_state(
         ]
         if not resets:
             continue
-        reset_texts = kept_resets
+        texts = kept
         if quantity == "position":  # velocities do not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
-            best_state = min(
-                _continuous_candidates(ekf2.state[columns], resets, axes),
-                key=partial(_median_square_distance, samples),
-            )
-            if _median_square_distance(
-                samples, best_state
-            ) < MAX_DISTANCE_RATIO * _median_square_distance(samples, ekf2.state):
-                state[columns], reset_texts = best_state, removed_resets
-        reset_texts.append(f"{len(resets)} of {label}")
-    statements = []
-    if removed_resets:
-        statements.append(
-            f"EKF2 resets removed: {', '.join(removed_resets)} (they move the origin)"
+            distance = partial(_median_square_distance, samples)
+            candidates = _continuous_candidates(ekf2.state[columns], resets, axes)
+            best_state = min(candidates, key=distance)
+            if distance(best_state) < MAX_DISTANCE_RATIO * distance(ekf2.state):
+                state[columns], texts = best_state, removed
+        texts.append(f"{len(resets)} of {label}")
+    statements = (
+        f"EKF2 resets {treatment}: {', '.join(texts)} ({reason})"
+        for treatment, texts, reason in (
+            ("removed", removed, "they move the origin"),
+            ("not removed", kept, "they correct an error"),
         )
-    if kept_resets:
-        statements.append(
-            f"EKF2 resets not removed: {', '.join(kept_resets)} (they correct an error)"
-        )
+        if texts
+    )
     return state, "; ".join(statements)
 
 
@@ -254,7 +248,7 @@ def observation_variance(
     noise_m = default_noise_m if aid is None else parameters.get(aid.noise, default_noise_m)
     if aid is None or math.isnan(noise_m):
         return math.nan
-    scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
+    scale = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
     configured_m2 = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # EKF2 did not receive the variance in a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER

@@ -140,9 +140,9 @@ def delay_ms(comparison: Comparison) -> float | None:
     )
 
 
-def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str, float]:
+def ml_noise_change(inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
     """Return EKF2's parameters for ``noise_m`` if the flown noise is outside the 95 % interval."""
-    if (estimate.low or 0.0) <= noise_used_m(inputs) <= (estimate.high or math.inf):
+    if (ml_noise.low or 0.0) <= noise_used_m(inputs) <= (ml_noise.high or math.inf):
         return {}
     return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
 

@@ -186,10 +186,10 @@ def distance_from_one(statistics: RunStatistics) -> float:
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
     """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
-    becomes_consistent = enters_band(trial)
+    is_solved = becomes_consistent(trial)
     return (
-        not becomes_consistent,
-        len(trial.change) if becomes_consistent else 0,
+        not is_solved,
+        len(trial.change) if is_solved else 0,
         distance_from_one(trial.after),
     )
 
@@ -214,7 +214,7 @@ def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
 
-def enters_band(trial: Trial) -> bool:
+def becomes_consistent(trial: Trial) -> bool:
     """Return True if a re-run makes a σ ratio consistent."""
     return any(
         classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
@@ -222,7 +222,7 @@ def enters_band(trial: Trial) -> bool:
     )
 
 
-def halves(trial: Trial) -> bool:
+def halves_discrepancy(trial: Trial) -> bool:
     """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
     return any(
         classify_ratio(before, name) != "consistent"
@@ -231,7 +231,7 @@ def halves(trial: Trial) -> bool:
     )
 
 
-def leaves_error(trial: Trial) -> bool:
+def remains_overconfident(trial: Trial) -> bool:
     """Return True if the filter remains nearly as overconfident against ground truth as before."""
     return any(
         name == "truth"
@@ -293,7 +293,7 @@ def improvement(trial: Trial) -> Improvement:
     is_position_better = bool(
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
-    is_sigma_better = (enters_band(trial) or halves(trial)) and all(
+    is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
         abs(math.log(after)) <= abs(math.log(before)) or classify_ratio(after, name) == "consistent"
         for name, before, after in ratio_pairs(trial)
     )

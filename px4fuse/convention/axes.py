@@ -77,34 +77,34 @@ class Family(NamedTuple):
 
     Attributes
     ----------
-    vertical, a, b : int
+    vertical_axis, axis_a, axis_b : int
         Indices (0: x, 1: y, 2: z) of the vertical axis and of the horizontal axes.
-    sign : {1, -1}
+    vertical_sign : {1, -1}
         1 if the vertical axis points down.
-    hand : {1, -1}
-        1 if axis ``b`` is 90° clockwise from axis ``a``.
+    handedness : {1, -1}
+        1 if ``axis_b`` is 90° clockwise from ``axis_a``.
     """
 
-    vertical: int
-    sign: int
-    a: int
-    b: int
-    hand: int
+    vertical_axis: int
+    vertical_sign: int
+    axis_a: int
+    axis_b: int
+    handedness: int
 
     @property
     def is_mirrored(self) -> bool:
-        return (self.sign * self.hand < 0) != (self.vertical == 1)
+        return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def axes(self, quarter: int) -> Axes:
-        """Return the directions of x, y, z with axis ``a`` at ``quarter`` · 90° from north."""
-        names: list[Direction] = ["down" if self.sign > 0 else "up"] * 3
-        names[self.a] = CLOCKWISE[quarter % 4]
-        names[self.b] = CLOCKWISE[(quarter + self.hand) % 4]
+        """Return the directions of x, y, z with ``axis_a`` at ``quarter`` · 90° from north."""
+        names: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
+        names[self.axis_a] = CLOCKWISE[quarter % 4]
+        names[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
         return names[0], names[1], names[2]
 
     def log_odds(self, quarter: int) -> float:
         axes = self.axes(quarter)
-        other = -2.0 if self.vertical == 2 or axes[1] == "up" else -4.0
+        other = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
         return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other)
 
 
@@ -128,8 +128,8 @@ class Positions:
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
-        edge = round(self.max_offset_s / GRID_S)
-        grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
+        margin = round(self.max_offset_s / GRID_S)
+        grid = imu.time_s[0] + GRID_S * np.arange(-margin, len(imu.time_s) + margin)
         return SourceMotion.of(self.time_s, self.position_m, grid)
 
 
@@ -140,7 +140,7 @@ class Hypothesis:
     Attributes
     ----------
     parameters : ndarray, shape (7,)
-        Delay of the timestamps (s), rotation of axis ``a`` clockwise from north (rad), heading
+        Delay of the timestamps (s), rotation of ``axis_a`` clockwise from north (rad), heading
         drift of the gyroscopes (rad/s), clock drift, accelerometer bias in FRD (m/s²).
     score : float
         Log likelihood plus log prior odds.
@@ -150,7 +150,7 @@ class Hypothesis:
         Bounds of the ratio of the source's distances to those of the IMU.
     sigma_m : float
         Scale (m) of the horizontal residuals.
-    windows : float
+    independent_count : float
         Number of independent residuals.
     """
 
@@ -163,7 +163,7 @@ class Hypothesis:
     scale: float = 1.0
     max_scale: float = 1.0
     sigma_m: float = 0.0
-    windows: float = 0.0
+    independent_count: float = 0.0
     heading_from: HeadingSource = "EKF2"
 
     @property
@@ -203,19 +203,19 @@ def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> 
 
     Empty without motion, or if positions and IMU data overlap for less than ``MIN_OVERLAP_S``.
     """
-    refined = []
+    hypotheses = []
     for heading_from, imu in motions.items():
         source = positions.motion(imu)
         for candidate in find_candidates(source, imu):
             start = replace(candidate, heading_from=heading_from)
-            refined.append(refine(start, positions, source, imu))
+            hypotheses.append(refine(start, positions, source, imu))
             if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
                 parameters = start.parameters.copy()
                 parameters[1] -= candidate.remainder_rad
                 start = replace(start, parameters=parameters, has_rotation=False)
-                refined.append(refine(start, positions, source, imu))
+                hypotheses.append(refine(start, positions, source, imu))
     return sorted(
-        (hypothesis for hypothesis in refined if hypothesis.score > -np.inf),
+        (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
     )
 
@@ -225,28 +225,31 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
 
     For each unit, axes and quarter turn, only the best time offset is kept.
     """
-    left = np.column_stack([source.table, source.table**2, source.is_valid])
-    right = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
-    steps = np.arange(len(left) - len(right) + 1)
-    means = np.stack([left[k : k + len(right)].T @ right for k in steps])
-    has_overlap = means[:, 6, 6] * GRID_S >= MIN_OVERLAP_S
+    source_columns = np.column_stack([source.table, source.table**2, source.is_valid])
+    imu_columns = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
+    steps = np.arange(len(source_columns) - len(imu_columns) + 1)
+    moments = np.stack([source_columns[k : k + len(imu_columns)].T @ imu_columns for k in steps])
+    # sums of products at each time offset; index 6 is a column of ones
+    has_overlap = moments[:, 6, 6] * GRID_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
-    offset_s, means = (steps[has_overlap] - steps[-1] / 2.0) * GRID_S, means[has_overlap]
-    windows = means[:, 6, 6, None, None] * (GRID_S / WINDOW_S)
-    means /= means[:, 6:, 6:]
-    vertical, sign, a, b, hand = np.array(FAMILIES).T
-    correlation = means[:, a, 0] + hand * means[:, b, 1] + 1j * means[:, a, 1]
-    correlation -= 1j * hand * means[:, b, 0]
-    square, unit = np.maximum(means[:, 3:6, 6, None], 1e-12), np.array([*UNITS.values()])
-    north2, east2, down2 = np.moveaxis(means[:, 6, 3:6, None, None], 1, 0)
-    horizontal = unit**2 * (square[:, a] + square[:, b]) + north2 + east2
-    horizontal = (horizontal - 2.0 * unit * np.abs(correlation)[..., None]) / 2.0
-    down = unit**2 * square[:, vertical] + down2
-    down -= 2.0 * unit * (sign * means[:, vertical, 2])[..., None]
-    score = np.sum(np.log(square), axis=1)[:, None] + 6.0 * np.log(unit)
-    score = score - 2.0 * np.log(np.maximum(horizontal, MIN_SIGMA_M**2))
-    score = 0.5 * windows * (score - np.log(np.maximum(down, MIN_SIGMA_DOWN_M**2)))
+    offset_s, moments = (steps[has_overlap] - steps[-1] / 2.0) * GRID_S, moments[has_overlap]
+    independent_count = moments[:, 6, 6, None, None] * (GRID_S / WINDOW_S)
+    moments /= moments[:, 6:, 6:]
+    vertical, sign, a, b, handedness = np.array(FAMILIES).T
+    correlation = moments[:, a, 0] + handedness * moments[:, b, 1] + 1j * moments[:, a, 1]
+    correlation -= 1j * handedness * moments[:, b, 0]
+    source_square, unit = np.maximum(moments[:, 3:6, 6, None], 1e-12), np.array([*UNITS.values()])
+    north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
+    horizontal_square = (
+        unit**2 * (source_square[:, a] + source_square[:, b]) + north_square + east_square
+    )
+    horizontal_square = (horizontal_square - 2.0 * unit * np.abs(correlation)[..., None]) / 2.0
+    down_square = unit**2 * source_square[:, vertical] + imu_down_square
+    down_square -= 2.0 * unit * (sign * moments[:, vertical, 2])[..., None]
+    score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit)
+    score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
+    score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
     angle = np.angle(correlation)
     quarter = np.round(angle / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
@@ -254,9 +257,11 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
         score_of_quarter = np.where((quarter == k)[..., None], score, -np.inf)
         for (f, u), row in np.ndenumerate(np.argmax(score_of_quarter, axis=0)):
             name, family = [*UNITS][u], FAMILIES[f]
-            total = score_of_quarter[row, f, u] + family.log_odds(k) + UNIT_ODDS * (name != "m")
+            total_score = (
+                score_of_quarter[row, f, u] + family.log_odds(k) + UNIT_ODDS * (name != "m")
+            )
             parameters = np.array([offset_s[row], angle[row, f], *[0.0] * 5])
-            hypotheses.append(Hypothesis(family, name, parameters, float(total)))
+            hypotheses.append(Hypothesis(family, name, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -290,19 +295,19 @@ def _evaluate(
     at = time_s - offset_s - clock_drift * (time_s - middle_s)
     at = (at - imu.time_s[0]) / GRID_S
     index = np.clip(np.floor(at).astype(int), 0, len(imu.time_s) - 2)
-    used = (at >= 0) & (at < len(imu.time_s) - 1) & imu.is_valid[index]
-    windows = float(np.count_nonzero(used)) * row_s / WINDOW_S
-    if windows * WINDOW_S < MIN_OVERLAP_S:
+    is_used = (at >= 0) & (at < len(imu.time_s) - 1) & imu.is_valid[index]
+    independent_count = float(np.count_nonzero(is_used)) * row_s / WINDOW_S
+    if independent_count * WINDOW_S < MIN_OVERLAP_S:
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
-    index, time_s = index[used], time_s[used]
+    index, time_s = index[is_used], time_s[is_used]
     flown_s = time_s - time_s[0]
-    fraction = (at[used] - index)[:, None, None]
+    fraction = (at[is_used] - index)[:, None, None]
     table = (1.0 - fraction) * imu.table[index] + fraction * imu.table[index + 1]
-    sent, (vertical, sign, a, b, hand) = source.table[rows[used]], hypothesis.family
+    sent, (vertical, sign, a, b, handedness) = source.table[rows[is_used]], hypothesis.family
     unit = UNITS[hypothesis.unit]
-    turn = unit * np.exp(1j * (angle + heading_drift * flown_s))
-    horizontal = turn * (sent[:, a] + 1j * hand * sent[:, b])
-    ned = np.column_stack([horizontal.real, horizontal.imag, unit * sign * sent[:, vertical]])
+    rotation = unit * np.exp(1j * (angle + heading_drift * flown_s))
+    horizontal_m = rotation * (sent[:, a] + 1j * handedness * sent[:, b])
+    ned = np.column_stack([horizontal_m.real, horizontal_m.imag, unit * sign * sent[:, vertical]])
     measured = table[..., 0] - table[..., 1:] @ bias
     residual = ned - measured
     squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
@@ -321,28 +326,31 @@ def _evaluate(
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
-    jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
+    jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
     jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = table[..., 1:]
     is_drifting = hypothesis.heading_from != "EKF2"
-    free = np.array(
+    is_free = np.array(
         [True, hypothesis.has_rotation, is_drifting, hypothesis.has_clock_drift, *[True] * 3]
     )
-    weights, columns = weight[[0, 0, 1]].T.ravel(), jacobian[..., free].reshape(-1, free.sum())
-    weighted = columns.T * weights
-    normal = weighted @ columns + np.diag(PRECISION[free] + 1e-9)
-    gradient = weighted @ residual.ravel() + (PRECISION * hypothesis.parameters)[free]
+    weights, columns = (
+        weight[[0, 0, 1]].T.ravel(),
+        jacobian[..., is_free].reshape(-1, is_free.sum()),
+    )
+    weighted_columns = columns.T * weights
+    normal_matrix = weighted_columns @ columns + np.diag(PRECISION[is_free] + 1e-9)
+    gradient = weighted_columns @ residual.ravel() + (PRECISION * hypothesis.parameters)[is_free]
     step = np.zeros(len(PRECISION))
-    step[free] = -np.linalg.solve(normal, gradient)
+    step[is_free] = -np.linalg.solve(normal_matrix, gradient)
     step[0] = np.clip(step[0], -MAX_STEP_S, MAX_STEP_S)
     scored = replace(
         hypothesis,
-        score=float(windows * gain - 0.5 * PRECISION @ hypothesis.parameters**2),
+        score=float(independent_count * gain - 0.5 * PRECISION @ hypothesis.parameters**2),
         scale=product / square,
         max_scale=ned_square / product,
         sigma_m=sigma_m,
-        windows=windows,
+        independent_count=independent_count,
     )
     return scored, step
 
@@ -360,21 +368,21 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 def _log_odds(hypothesis: Hypothesis, positions: Positions) -> float:
     """Return the log prior odds of a hypothesis, plus the log likelihood of its heights."""
-    odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
-    odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
+    log_odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
+    log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:
-        odds -= 0.5 * float(np.log(max(hypothesis.windows, 2.0)))
-        odds += ROTATION_ODDS if abs(hypothesis.remainder_rad) > SMALL_ROTATION else -0.5
+        log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
+        log_odds += ROTATION_ODDS if abs(hypothesis.remainder_rad) > SMALL_ROTATION else -0.5
     if positions.barometer is None:
-        return odds
+        return log_odds
     barometer = np.interp(positions.time_s - hypothesis.offset_s, *positions.barometer)
     down = (
         UNITS[hypothesis.unit]
-        * hypothesis.family.sign
-        * positions.position_m[:, hypothesis.family.vertical]
+        * hypothesis.family.vertical_sign
+        * positions.position_m[:, hypothesis.family.vertical_axis]
     )
     error = down - np.median(down) + barometer - np.median(barometer)
     square = float(np.mean(np.minimum(error**2, (20.0 * BAROMETER_SIGMA_M) ** 2)))
     floor = BAROMETER_SIGMA_M**2
     ratio = max(float(np.var(barometer)), floor) / max(square, floor)
-    return odds + 0.5 * BAROMETER_WEIGHT * float(np.log(ratio))
+    return log_odds + 0.5 * BAROMETER_WEIGHT * float(np.log(ratio))

@@ -145,14 +145,14 @@ def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) ->
     if best.score < MIN_GAIN:
         verdict = "not determinable"
     elif (
-        best.score < MIN_GAIN_PER_WINDOW[is_ambiguous] * best.windows
+        best.score < MIN_GAIN_PER_WINDOW[is_ambiguous] * best.independent_count
         or best.scale > MAX_SCALE
         or best.max_scale < MIN_SCALE
         or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO
     ):
         verdict = "doubtful"
     x, y, z = best.axes
-    likely = [
+    likely_conventions = [
         _describe(hypothesis)
         for hypothesis in rivals
         if hypothesis.score > best.score - MIN_LOG_ODDS
@@ -171,7 +171,7 @@ def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) ->
         scale=best.scale,
         log_odds=log_odds,
         log_likelihood_gain=best.score,
-        alternatives=tuple(dict.fromkeys(likely)),
+        alternatives=tuple(dict.fromkeys(likely_conventions)),
     )
 
 
@@ -201,19 +201,19 @@ def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
 
 def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
-    start = 0.0
+    start_drift = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
             (candidates[0], drift)
             for drift in DRIFTS.tolist()
             if (candidates := find_candidates(positions.with_clock_drift(drift).motion(imu), imu))
         ]
-        candidate, start = max(hypotheses, key=lambda pair: pair[0].score)
-        best = replace(candidate, heading_from=best.heading_from)
-        positions = positions.with_clock_drift(start)
+        best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
+        best = replace(best_candidate, heading_from=best.heading_from)
+        positions = positions.with_clock_drift(start_drift)
     hypothesis = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
-    drift = (1.0 + start) / (1.0 - float(hypothesis.parameters[3])) - 1.0
-    return drift if start or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
+    drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
+    return drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
 
 
 def _check_orientation(
@@ -226,20 +226,20 @@ def _check_orientation(
     """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
-    checked = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
-    if checked is None:
+    result = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
+    if result is None:
         return None
-    convention, time_s, attitude = checked
+    convention, time_s, attitude = result
     is_known = convention.verdict in ("determined", "ambiguous") and verdict == "determined"
-    if not is_known or best.family.vertical != 2 or best.family.is_mirrored:
+    if not is_known or best.family.vertical_axis != 2 or best.family.is_mirrored:
         return convention
     own_heading = np.interp(inertial.time_s, time_s, heading(attitude))
-    motion = motion_from_imu(inertial, replace_heading(inertial.gyro, own_heading))
+    motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, own_heading))
     is_covered = (motion.time_s > time_s[0] + WINDOW_S) & (motion.time_s < time_s[-1] - WINDOW_S)
     motion = replace(motion, is_valid=motion.is_valid & is_covered)
     # correct headings (°) of the x axis of the positions, given the frame of the orientation
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
-    if best.family.sign > 0:
+    if best.family.vertical_sign > 0:
         directions_deg = [0.0]
     for hypothesis in search(positions, {"EKF2": motion}):
         if (hypothesis.family, hypothesis.unit, hypothesis.has_rotation) == (
@@ -248,6 +248,8 @@ def _check_orientation(
             True,
         ):
             x_deg = float(np.degrees(hypothesis.parameters[1]))
-            errors = [(x_deg - at_deg + 180.0) % 360.0 - 180.0 for at_deg in directions_deg]
+            errors = [
+                (x_deg - direction_deg + 180.0) % 360.0 - 180.0 for direction_deg in directions_deg
+            ]
             return structs.replace(convention, heading_error_deg=min(errors, key=abs))
     return convention

@@ -13,14 +13,21 @@ from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
 from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
 from px4fuse.core.arrays import Array
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    kind_without_orientation,
+    time_index,
+)
 from px4fuse.trajectory.rotation import from_elements, heading
 
 # Smaller rotations (°) of a frame with wrong axes are not converted, but reported as heading error
 MIN_REMAINDER_DEG = 8.0
 # Smaller rotations (°) of a frame with right axes are not converted, but reported as heading error
 MIN_ROTATION_DEG = 15.0
-# Smaller time offsets (s) are not corrected, but reported as clock offset
+# Smaller time offsets (s) are not corrected, but reported as time offset
 MIN_LATE_S = 0.5
 # Minimum heading error (°) of a wrong orientation, relative to the motion of the same source
 MIN_HEADING_ERROR_DEG = 10.0
@@ -34,7 +41,7 @@ class Faults:
 
     Attributes
     ----------
-    axes : bool
+    has_wrong_axes : bool
         True if the axes are not NED, even after a rotation about the vertical.
     rotation_deg : float
         Clockwise rotation of the positions from NED, or from ENU or NWU if these are their axes.
@@ -50,9 +57,9 @@ class Faults:
         True if several conventions fit, but not NED in metres.
     """
 
-    axes: bool = False
+    has_wrong_axes: bool = False
     rotation_deg: float = 0.0
-    unit: bool = False
+    has_wrong_unit: bool = False
     late_s: float = 0.0
     clock_drift: float = 0.0
     orientation: OrientationFault = ""
@@ -63,7 +70,13 @@ class Faults:
     @property
     def of_positions(self) -> bool:
         """True if axes, rotation, unit or timestamps of the positions are wrong."""
-        return bool(self.axes or self.rotation_deg or self.unit or self.late_s or self.clock_drift)
+        return bool(
+            self.has_wrong_axes
+            or self.rotation_deg
+            or self.has_wrong_unit
+            or self.late_s
+            or self.clock_drift
+        )
 
     def __bool__(self) -> bool:
         return self != Faults()
@@ -81,26 +94,26 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=fault)
-    fusing = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
-    is_fused = isinstance(fusing, pd.DataFrame) and bool((fusing > 0).any(axis=None))
-    axes, rotation_deg = _axes_and_rotation(convention)
+    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
+    is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
+    has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
     # EKF2 fused the yaw of the source, so nothing in the log shows north
     has_own_heading = (
         is_fused and is_drifting and convention.orientation is not None and fault != "copied"
     )
-    is_other_drift = is_drifting and not is_fused and not axes
+    is_other_drift = is_drifting and not is_fused and not has_wrong_axes
     if has_wrong_heading or has_own_heading or is_other_drift or frame == "FRD":
         rotation_deg = 0.0
     faults = Faults(
-        axes=axes,
+        has_wrong_axes=has_wrong_axes,
         rotation_deg=rotation_deg,
-        unit=convention.unit != "m",
+        has_wrong_unit=convention.unit != "m",
         late_s=convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=fault,
-        is_north_unknown=axes and has_own_heading,
+        is_north_unknown=has_wrong_axes and has_own_heading,
     )
     return replace(faults, affects_ekf2=is_fused and (faults.of_positions or has_wrong_heading))
 
@@ -125,13 +138,13 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
     if orientation.order != "w x y z":
         return "order"
     is_ned = convention.verdict == "determined" and convention.z == "down"
-    usual = {"FRD to NED"} if is_ned else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
-    if orientation.frames not in usual:
+    expected_frames = {"FRD to NED"} if is_ned else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
+    if orientation.frames not in expected_frames:
         return "frames"
     return "heading" if abs(orientation.heading_error_deg or 0.0) > MIN_HEADING_ERROR_DEG else ""
 
 
-def correct(
+def correct_convention(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's convention.
@@ -153,7 +166,7 @@ def correct(
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
     if faults.orientation == "copied" and origin.kind == "vio":
-        origin = structs.replace(origin, kind="uwb")
+        origin = structs.replace(origin, kind=kind_without_orientation(samples))
     if faults.orientation in ("copied", "heading"):
         orientation = None
     elif orientation is not None and convention.orientation is not None:
@@ -166,7 +179,7 @@ def correct(
         return flight, track
     attitude = inertial.attitudes[convention.heading_from]
     # the axes of the positions are right: rotate the attitude to the same north
-    if not faults.axes and not faults.rotation_deg:
+    if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
     attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
@@ -175,7 +188,7 @@ def correct(
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     scale = UNITS[convention.unit]
-    if not faults.axes and not faults.rotation_deg:
+    if not faults.has_wrong_axes and not faults.rotation_deg:
         return scale * np.eye(3)
     permutation = [
         [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]

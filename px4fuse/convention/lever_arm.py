@@ -65,8 +65,11 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
         samples = samples.loc[airborne[0][0] : airborne[-1][1]]
     if isinstance(attitude, Unavailable) or len(samples) < 2:
         return None
-    time_s, known = samples.index.to_numpy(), truth.samples
-    true_m = [np.interp(time_s, known.index, known[name], np.nan, np.nan) for name in columns]
+    time_s, true_samples = samples.index.to_numpy(), truth.samples
+    true_m = [
+        np.interp(time_s, true_samples.index, true_samples[name], np.nan, np.nan)
+        for name in columns
+    ]
     error_m = samples.to_numpy() - np.transpose(true_m)
     # a delay is estimated too (error = velocity · delay), because it resembles a lever arm
     velocity_m_s = np.gradient(np.transpose(true_m), time_s, axis=0)
@@ -83,8 +86,8 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
         return None
     residual = (values - rows @ fit).reshape(-1, 2)
     # successive errors of a source may be correlated
-    excess = max(map(autocorrelation_time, residual.T))
-    covariance = np.linalg.inv(rows.T @ rows) * np.mean(residual**2) * excess
+    variance_factor = max(map(autocorrelation_time, residual.T))
+    covariance = np.linalg.inv(rows.T @ rows) * np.mean(residual**2) * variance_factor
     sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
     arm = LeverArm(float(fit[0]), float(fit[1]), sigma_m)
     is_significant = arm.size_m > max(MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS * sigma_m)
@@ -99,20 +102,22 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     attitude = inertial.attitudes["EKF2"]
     imu = motion_from_imu(inertial, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
-    arms = SourceMotion.of(inertial.time_s, rotation, imu.time_s).table.reshape(-1, 2, 2)
-    design = np.concatenate([arms, imu.rate_m_s[:, :2, None], imu.table[:, :2, 1:]], axis=2)
+    arm_differences = SourceMotion.of(inertial.time_s, rotation, imu.time_s).table.reshape(-1, 2, 2)
+    design = np.concatenate(
+        [arm_differences, imu.rate_m_s[:, :2, None], imu.table[:, :2, 1:]], axis=2
+    )
     time_s, is_used = samples.index.to_numpy(), imu.is_valid
     for _ in range(ITERATIONS):
         source = SourceMotion.of(time_s, samples.to_numpy(), imu.time_s)
         is_used = is_used & source.is_valid
-        excess = source.table - imu.table[:, :2, 0]
-        rows, values = design[is_used].reshape(-1, design.shape[2]), excess[is_used].ravel()
+        difference_m = source.table - imu.table[:, :2, 0]
+        rows, values = design[is_used].reshape(-1, design.shape[2]), difference_m[is_used].ravel()
         # second differences overlap over twice the window, so only these are independent
         count = len(values) * GRID_S / (2.0 * WINDOW_S)
         if count < 2 * rows.shape[1]:
             return None
         fit = np.linalg.lstsq(rows, values, rcond=None)[0]
-        residual: Array = np.linalg.norm(excess - design @ fit, axis=1)
+        residual: Array = np.linalg.norm(difference_m - design @ fit, axis=1)
         sigma_m = float(np.sqrt(np.mean(residual[is_used] ** 2) / 2.0))
         covariance = np.linalg.pinv(rows.T @ rows) * sigma_m**2 * len(values) / count
         sigma = float(np.sqrt(np.trace(covariance[:2, :2])))

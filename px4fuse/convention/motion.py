@@ -58,9 +58,9 @@ class Inertial:
     time_s : ndarray, shape (n + 1,)
     force_m_s2 : ndarray, shape (n, 3)
         Mean specific force in the body frame (FRD) between successive times.
-    logged : ndarray, shape (n + 1, 4)
+    logged_attitude : ndarray, shape (n + 1, 4)
         EKF2's attitude as quaternion (w, x, y, z; FRD to NED).
-    gyro : ndarray, shape (n + 1, 4)
+    gyro_attitude : ndarray, shape (n + 1, 4)
         Attitude integrated from the gyroscopes, with the tilt corrected by gravity.
     valid_spans_s : tuple of (float, float)
         Time spans in flight without a gap in the IMU data.
@@ -68,14 +68,17 @@ class Inertial:
 
     time_s: Array
     force_m_s2: Array
-    logged: Array
-    gyro: Array
+    logged_attitude: Array
+    gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro``, and the heading of EKF2 or of ``gyro``."""
-        return {"EKF2": replace_heading(self.gyro, heading(self.logged)), "gyroscopes": self.gyro}
+        """Attitudes with the tilt of ``gyro_attitude``, and the heading of EKF2 or gyroscopes."""
+        return {
+            "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
+            "gyroscopes": self.gyro_attitude,
+        }
 
 
 @dataclass(frozen=True)
@@ -133,8 +136,8 @@ def read_inertial(flight: Flight) -> Inertial | None:
     integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
     steps = np.diff([np.interp(time_s, imu_s, column) for column in integral.T]).T
     force = steps[:, :3] / STEP_S
-    logged = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    gyro = _level(_integrate_gyros(steps[:, 3:], logged), force)
+    logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
+    gyro_attitude = _level(_integrate_gyros(steps[:, 3:], logged_attitude), force)
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
@@ -143,20 +146,22 @@ def read_inertial(flight: Flight) -> Inertial | None:
     spans = (
         (max(start, begin), min(stop, end)) for begin, end in edges for start, stop in airborne
     )
-    return Inertial(time_s, force, logged, gyro, tuple(s for s in spans if s[0] < s[1]))
+    return Inertial(
+        time_s, force, logged_attitude, gyro_attitude, tuple(s for s in spans if s[0] < s[1])
+    )
 
 
-def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
+def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
     """Integrate the gyroscopes without their bias, from the first logged attitude.
 
     The bias is the median rotation rate relative to the logged attitude, so heading resets have no
     effect.
     """
-    excess = angle_rad - to_vector(multiply(conjugate(logged[:-1]), logged[1:]))
+    excess = angle_rad - to_vector(multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:]))
     total = np.cumsum(excess, axis=0)
     window = round(GYRO_BIAS_WINDOW_S / STEP_S)
     bias = np.median(total[window:] - total[:-window], axis=0) / window
-    return cumulative_product(np.concatenate([logged[:1], from_vector(angle_rad - bias)]))
+    return cumulative_product(np.concatenate([logged_attitude[:1], from_vector(angle_rad - bias)]))
 
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
@@ -173,10 +178,10 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     """Return the centred running mean over ``width`` rows, without invalid rows."""
     rows = np.arange(len(values))
     low, high = np.clip(rows - width // 2, 0, None), np.clip(rows + width // 2 + 1, None, len(rows))
-    flat = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
-    total = np.cumsum(np.column_stack([flat, is_valid]), axis=0)
-    total = np.concatenate([np.zeros_like(total[:1]), total])
-    sums = total[high] - total[low]
+    valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
+    cumulative = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
+    cumulative = np.concatenate([np.zeros_like(cumulative[:1]), cumulative])
+    sums = cumulative[high] - cumulative[low]
     means: Array = sums[:, :-1] / np.maximum(sums[:, -1:], 1.0)
     return means.reshape(values.shape)
 
@@ -203,9 +208,9 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     position = np.zeros((len(attitude), 3, 4))
     velocity = np.cumsum(table, axis=0) * STEP_S
     np.cumsum((velocity - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
-    window, every = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
-    second = second_difference(position, window)[::every]
-    time_s = inertial.time_s[window:-window][::every]
+    window, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
+    second = second_difference(position, window)[::stride]
+    time_s = inertial.time_s[window:-window][::stride]
     # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
@@ -216,6 +221,8 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half)
-    return multiply(np.stack([np.cos(half), zeros, zeros, np.sin(half)], axis=-1), attitude)
+    half_angle = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half_angle)
+    return multiply(
+        np.stack([np.cos(half_angle), zeros, zeros, np.sin(half_angle)], axis=-1), attitude
+    )

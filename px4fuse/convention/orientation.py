@@ -79,23 +79,25 @@ def check_orientation(
     time, sent = time_s[rows], quaternion[rows]
     sent = sent / np.linalg.norm(sent, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
-        logged = interpolate(time - delay_s, inertial.time_s, inertial.logged)
-        cosine = np.clip(np.abs(np.sum(sent * logged, axis=1)), 0.0, 1.0)
+        logged_attitude = interpolate(time - delay_s, inertial.time_s, inertial.logged_attitude)
+        cosine = np.clip(np.abs(np.sum(sent * logged_attitude, axis=1)), 0.0, 1.0)
         if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DEG):
             return OrientationConvention(verdict="copied"), time, sent
-    reference = interpolate(time, inertial.time_s, inertial.gyro)
+    reference = interpolate(time, inertial.time_s, inertial.gyro_attitude)
     candidates = [
         _make_candidate(time, sent, reference, order, frames, quarters)
         for order, frames, quarters in product(ORDERS, FRAMES, range(4))
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best = candidates[0]
-    rival = next(one for one in candidates if one.order_and_frames != best.order_and_frames)
+    second_best = next(
+        candidate for candidate in candidates if candidate.order_and_frames != best.order_and_frames
+    )
     convention = best.convention
     tilt_deg = convention.tilt_difference_deg
     if tilt_deg > MAX_TILT_DEG or best.heading_difference_deg > MAX_HEADING_DEG:
         convention = replace(convention, verdict="unrelated")
-    elif best.score - rival.score < MIN_LOG_ODDS:
+    elif best.score - second_best.score < MIN_LOG_ODDS:
         convention = replace(convention, verdict="ambiguous")
     return convention, time, to_attitude(sent, convention)
 
@@ -119,8 +121,8 @@ def _make_candidate(
     cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
     tilt_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
     tilt_deg, heading_deg = np.degrees(np.median([tilt_rad, spread_rad], axis=1)).tolist()
-    logs = np.log(np.maximum([tilt_deg, heading_deg], MIN_DIFFERENCE_DEG))
-    score = -SCORE_PER_S * (time[-1] - time[0]) * float(np.sum(logs))
+    log_differences = np.log(np.maximum([tilt_deg, heading_deg], MIN_DIFFERENCE_DEG))
+    score = -SCORE_PER_S * (time[-1] - time[0]) * float(np.sum(log_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
     convention = replace(convention, tilt_difference_deg=tilt_deg)

@@ -65,15 +65,6 @@ def check_readable(path: Path, folders: Sequence[Path]) -> None:
 def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
     """Return the size (bytes) of a regular file, and register the file as an input.
 
-    Parameters
-    ----------
-    path : Path
-        File whose symbolic links are followed.
-    error_type : type
-        Type of the error to raise.
-    name : str, optional
-        Name of the file in messages; by default :func:`display_name`.
-
     Raises
     ------
     Px4FuseError
@@ -116,16 +107,8 @@ def read_bytes_limited(
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
 
-    Parameters
-    ----------
-    error_type : type
-        Type of the error to raise.
-    name : str, optional
-        Name of the file in messages; by default :func:`display_name`.
-    size_remedy : str
-        Action in the error for a file that is too large.
-    empty_remedy : str, optional
-        Action in the error for an empty file; without this argument, empty files are accepted.
+    ``size_remedy`` and ``empty_remedy`` are the actions for a file that is too large or empty.
+    Without ``empty_remedy``, empty files are accepted.
 
     Raises
     ------
@@ -201,9 +184,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
             ]
         elif (size := file_size(path, LogError)) > limit:
-            raise LogError(
-                format_size_limit(display_name(path), size, limit), f"{LOG_SIZE_REMEDY}."
-            )
+            raise LogError(format_size_limit(display_name(path), size, limit), LOG_SIZE_REMEDY)
         else:
             files = [path]
         for file in files:

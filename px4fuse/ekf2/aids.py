@@ -13,6 +13,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
 from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, step_values_at
@@ -299,8 +300,7 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
         return "" if noise is None else aid.noise_origin
-    # EKF2 multiplies EKF2_GPS_P_NOISE by 1.5 for GNSS heights
-    for expected_noise in (value, 1.5 * value, np.sqrt(value)):
+    for expected_noise in (value, GNSS_HEIGHT_NOISE_FACTOR * value, np.sqrt(value)):
         if abs(noise - expected_noise) <= NOISE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
@@ -309,8 +309,8 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 def _longest_gap(
     times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    is_inside = (log.unjudged_s > start_s) & (log.unjudged_s < end_s)
-    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unjudged_s[is_inside])
+    is_inside = (log.unknown_fusion_s > start_s) & (log.unknown_fusion_s < end_s)
+    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unknown_fusion_s[is_inside])
     starts = ends[:-1]
     is_enabled = np.ones(len(starts), bool)
     if log.enabled is not None:

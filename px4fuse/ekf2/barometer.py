@@ -123,19 +123,23 @@ def _known_and_simulated_samples(
     )
     row = np.searchsorted(row_s[1:], time_s - MATCH_TOLERANCE * interval_s)
     row = np.minimum(row, len(count) - 1)
-    place = (time_s - row_s[row]) / sample_s[row]
-    is_matched = is_regular[row] & (np.abs(place - np.rint(place)) < MATCH_TOLERANCE)
-    is_matched &= (place > MATCH_TOLERANCE) & (place < count[row] + MATCH_TOLERANCE)
-    innovation_m[row[is_matched], np.rint(place[is_matched]).astype(int) - 1] = (
+    position_in_interval = (time_s - row_s[row]) / sample_s[row]
+    is_matched = is_regular[row] & (
+        np.abs(position_in_interval - np.rint(position_in_interval)) < MATCH_TOLERANCE
+    )
+    is_matched &= (position_in_interval > MATCH_TOLERANCE) & (
+        position_in_interval < count[row] + MATCH_TOLERANCE
+    )
+    innovation_m[row[is_matched], np.rint(position_in_interval[is_matched]).astype(int) - 1] = (
         down_m - prediction_m(time_s)
     )[is_matched]
     if "filtered_down" in rows:
         # the sign is reversed, because PX4 logs state minus measurement
         filtered_m = -rows["filtered_down"].to_numpy()
-        age = count[:, None] - 1.0 - column
-        is_missing = np.isnan(innovation_m) & (age >= 0.0) & is_regular[:, None]
+        age_samples = count[:, None] - 1.0 - column
+        is_missing = np.isnan(innovation_m) & (age_samples >= 0.0) & is_regular[:, None]
         innovation_m = _with_missing_innovations(
-            innovation_m, is_missing, sample_s[:, None], age, filtered_m
+            innovation_m, is_missing, sample_s[:, None], age_samples, filtered_m
         )
     sampled_s = row_s[:-1, None] + sample_s[:, None] * (column + 1)
     has_sample = np.isfinite(innovation_m)
@@ -149,7 +153,11 @@ def _known_and_simulated_samples(
 
 
 def _with_missing_innovations(
-    innovation_m: Array, is_missing: BoolArray, interval_s: Array, age: Array, filtered_m: Array
+    innovation_m: Array,
+    is_missing: BoolArray,
+    interval_s: Array,
+    age_samples: Array,
+    filtered_m: Array,
 ) -> Array:
     """Simulate missing innovations that agree with the logged low-pass filtered innovation.
 
@@ -165,12 +173,12 @@ def _with_missing_innovations(
         Low-pass filtered innovation, at the start and at each row.
     """
     new_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
-    weight = new_weight * (1.0 - new_weight) ** np.maximum(age, 0.0)
+    weight = new_weight * (1.0 - new_weight) ** np.maximum(age_samples, 0.0)
     missing_weight = weight * is_missing
     scatter_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    decay = (1.0 - new_weight[:, 0]) ** (age[:, 0] + 1.0)
+    decay = (1.0 - new_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
     known_m = np.nansum(weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(axis=1)
     offset_m = filtered_m[1:] - decay * filtered_m[:-1] - known_m
     offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT)

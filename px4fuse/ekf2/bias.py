@@ -59,8 +59,8 @@ class BiasEstimator:
             Number of samples that EKF2 fused per known sample.
         """
         has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
-        density = np.where(has_offset, RANDOM_WALK_FACTOR * BIAS_DENSITY**2, BIAS_DENSITY**2)
-        variance = np.minimum(self.variance_m2 + density * interval_s, noise_m2)
+        variance_rate = np.where(has_offset, RANDOM_WALK_FACTOR * BIAS_DENSITY**2, BIAS_DENSITY**2)
+        variance = np.minimum(self.variance_m2 + variance_rate * interval_s, noise_m2)
         nu = nu + self.value_m
         R = noise_m2 + variance
         S = variance + (noise_m2 + predicted_variance) / weight

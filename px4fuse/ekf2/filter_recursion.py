@@ -21,7 +21,14 @@ from scipy.linalg import block_diag
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.flow import fuse_flow
-from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA, SENSORS, HeightFilter, barometer_samples
+from px4fuse.ekf2.heights import (
+    GNSS_HEIGHT_NOISE_FACTOR,
+    MIN_GATE,
+    MIN_SIGMA,
+    SENSORS,
+    HeightFilter,
+    barometer_samples,
+)
 from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
@@ -63,10 +70,9 @@ INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
 VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
-# Factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
-HEIGHT_NOISE_FACTOR = 1.5
+GRAVITY = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
-MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
+MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY
 # Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
 # (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
@@ -74,7 +80,6 @@ MIN_BIAS_VARIANCE_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
 BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
-GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
@@ -554,10 +559,10 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def _reduce_variance_to(P: Array, row: int, target: Array) -> ArrayPair:
+def _reduce_variance_to(P: Array, row: int, target_variance: Array) -> ArrayPair:
     """Return gain and covariance after an update that reduces a state's variance to ``target``."""
     variance = P[:, row, row]
-    R = _noise_to_reach(variance, target)
+    R = _noise_to_reach(variance, target_variance)
     K = P[:, :, row] / (variance + R)[:, None]
     return K, P - K[:, :, None] * P[:, None, row]
 
@@ -683,22 +688,15 @@ def _variance_growth(
 
     EKF2 adds no process noise to a state variance above the limit.
     """
-    field_parameters = ("MAG_E", "MAG_B") if segment.field is not None else ()
-    noise_density = np.stack(
-        [parameters[f"EKF2_{name}_NOISE"] for name in ("GYR_B", "ACC_B", *field_parameters)],
-        axis=-1,
+    names = {"GYR_B": "GYR", "ACC_B": "ACC"}
+    if segment.field is not None:
+        names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
+    density, limit = (
+        np.stack([parameters[f"EKF2_{name}_NOISE"] for name in noises], axis=-1)
+        for noises in (names, names.values())
     )
-    noise_density[:, :2] *= np.stack([attitude, biases], axis=-1)
-    noise_limit = np.stack(
-        [
-            parameters[f"EKF2_{name}_NOISE"]
-            for name in ("GYR", "ACC", *["MAG"] * len(field_parameters))
-        ],
-        axis=-1,
-    )
-    return np.repeat((noise_density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(
-        noise_limit**2, 3, axis=-1
-    )
+    density[:, :2] *= np.stack([attitude, biases], axis=-1)
+    return np.repeat((density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(limit**2, 3, axis=-1)
 
 
 def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
@@ -753,39 +751,41 @@ def _diagonal(P: Array) -> Array:
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
-def _start_state(segment: ReplaySegment, biases: BoolArray, attitude: BoolArray) -> ArrayPair:
-    x = np.tile(segment.state, (len(biases), 1))
+def _start_state(
+    segment: ReplaySegment, has_biases: BoolArray, has_attitude: BoolArray
+) -> ArrayPair:
+    x = np.tile(segment.state, (len(has_biases), 1))
     deviation = np.sqrt(segment.variance)
-    P = np.tile(deviation[:, None] * segment.correlation * deviation, (len(biases), 1, 1))
+    P = np.tile(deviation[:, None] * segment.correlation * deviation, (len(has_biases), 1, 1))
     for rows, is_estimated in (
-        (THETA, attitude),
-        (GYRO_BIAS, attitude),
-        (ACCELEROMETER_BIAS, biases),
+        (THETA, has_attitude),
+        (GYRO_BIAS, has_attitude),
+        (ACCELEROMETER_BIAS, has_biases),
     ):
         P[~is_estimated, :, rows] = 0.0
         P[~is_estimated, rows, :] = 0.0
         x[~is_estimated, rows] = 0.0
-    x[~biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
+    x[~has_biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
     return x, P
 
 
-def _noise_to_reach(variance: Array, target: Array) -> Array:
+def _noise_to_reach(variance: Array, target_variance: Array) -> Array:
     """Return the R with which an update reduces a state variance to a target.
 
     1/R = 1/target - 1/variance. EKF2's published height and heading are fused with this R to
     reproduce their logged variances.
     """
-    surplus = variance - target
-    noise = np.full(surplus.shape, IGNORED_VARIANCE)
-    np.divide(variance * target, surplus, out=noise, where=surplus > 0.0)
+    excess_variance = variance - target_variance
+    noise = np.full(excess_variance.shape, IGNORED_VARIANCE)
+    np.divide(variance * target_variance, excess_variance, out=noise, where=excess_variance > 0.0)
     return noise
 
 
-def _limit_bias(P: Array, floor: float, biases: BoolArray) -> None:
+def _limit_bias(P: Array, floor: float, has_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(MIN_BIAS_VARIANCE_RATIO * variance.max(axis=1, keepdims=True), floor)
-    variance[biases] = np.clip(variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[biases]
+    variance[has_biases] = np.clip(variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[has_biases]
 
 
 def _measurements(
@@ -826,6 +826,6 @@ def _measurements(
         noise[..., :3] = np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
     if aid == GNSS_POS:
         noise[..., 5] = np.maximum(
-            noise[..., 5], (HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
+            noise[..., 5], (GNSS_HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
         )
     return measured_values, noise

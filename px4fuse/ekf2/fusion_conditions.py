@@ -155,7 +155,7 @@ def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
 
 
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a source are constant, so that they are no measurement."""
+    """Return True if x and y of a source are constant: only its height is measured."""
     return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
 
 
@@ -184,7 +184,7 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
             "gap",
             f"no position for {duration_s:.1f} s from {last_s:.1f} s on",
             f"EKF2 stops fusion {limit_s:g} s after the last position.",
-            "Restore the line of sight and the link of the position source.",
+            "Check the position source and its data link.",
         )
 
 

@@ -47,6 +47,8 @@ MIN_BAROMETER_LOG_HZ = 4.0
 MIN_GATE = 1.0
 # Minimum measurement noise (σ) that EKF2 uses, for positions (m) and velocities (m/s)
 MIN_SIGMA = 0.01
+# Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
+GNSS_HEIGHT_NOISE_FACTOR = 1.5
 
 
 def add_heights(

@@ -482,13 +482,13 @@ def read_vision(
         variance = rotate(rotation**2, variance)
     age = record.vision_age_s
     # without arrival times no sample is treated as late
-    arrival = np.full(len(timestamp_s), -np.inf)
+    arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival = timestamp_s + np.interp(timestamp_s, age.index, age)
-    decisions = _logged_decisions(ekf2, record, timestamp_s, arrival)
+        arrival_s = timestamp_s + np.interp(timestamp_s, age.index, age)
+    decisions = _logged_decisions(ekf2, record, timestamp_s, arrival_s)
     return ReceivedPositions(
         timestamp_s,
-        arrival,
+        arrival_s,
         position,
         variance,
         *decisions,

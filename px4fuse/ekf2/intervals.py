@@ -116,9 +116,9 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     received = inputs.received
     time_s = segment.time_s
     first_row, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp = received.stamp_s[first_row:last_row]
+    stamp_s = received.stamp_s[first_row:last_row]
     last_step = len(time_s) - 1
-    measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
+    measured_s = stamp_s - timing.delay_s - 0.5 * inputs.step_s
     # a sample that arrives after the fusion horizon has passed its measurement time is fused late
     # or never
     due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
@@ -130,13 +130,13 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end[1:] > end[:-1]
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
-    action[np.isin(stamp, received.reset_s) & (action == FUSE)] = START
+    action[np.isin(stamp_s, received.reset_s) & (action == FUSE)] = START
     # in gaps of the position source there are additional events; their number does not depend on
     # the delay
-    gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])
+    gap_s = np.diff(np.r_[time_s[0], stamp_s, time_s[-1]])
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_places = np.cumsum(extra_events[:-1] + 1) - 1
-    total = len(stamp) + int(extra_events.sum())
+    total = len(stamp_s) + int(extra_events.sum())
     events = np.zeros(total, EVENT)
     events["end_step"] = np.rint(
         np.interp(np.arange(total), np.r_[-1, sample_places, total], np.r_[0, end, last_step])

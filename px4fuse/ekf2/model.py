@@ -199,30 +199,26 @@ def replay_settings(
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
-    unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
+    reasons = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
     height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
-        reason = "the log does not contain all fused magnetometer samples"
-        unused_parameters |= dict.fromkeys(
-            unmodelled & {*MAG.own_parameters, *FIELD_NOISES}, reason
-        )
-        unused_parameters |= dict.fromkeys(
-            unmodelled & BAROMETER.own_parameters,
-            "EKF2 fused no barometer height",
-        )
+        for names, reason in (
+            ((*MAG.own_parameters, *FIELD_NOISES), "the log lacks some fused magnetometer samples"),
+            (
+                BAROMETER.own_parameters,
+                height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
+            ),
+        ):
+            reasons |= dict.fromkeys(unmodelled & {*names}, reason)
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
-        unused_parameters["EKF2_DELAY_MAX"] = (
+        reasons["EKF2_DELAY_MAX"] = (
             f"in {firmware} the largest delay parameter is the delay of the fusion horizon"
         )
     if inputs.received.uses_sender_times:
-        unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
-    for name in [name for change in changes for name in change if name in unused_parameters]:
-        if inputs.logged_height_reason and name in BAROMETER.own_parameters:
-            raise SettingsError(
-                f"The effect of {name} cannot be predicted from this log: {height_text}."
-            )
-        raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")
+        reasons[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
+    for name in [name for change in changes for name in change if name in reasons]:
+        raise SettingsError(f"{name} has no effect in a replay of this log: {reasons[name]}.")
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
@@ -356,7 +352,7 @@ def run_configurations(
 
 def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
     index = pd.Index(run.segment.time_s, name="time_s")
-    position = state[:, POSITION] / run.segment.metres
+    position = state[:, POSITION] / run.segment.ekf2_metres_per_metre
     return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
 
 

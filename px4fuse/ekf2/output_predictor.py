@@ -79,7 +79,7 @@ def publish(
     return velocity, position + delay_by(reset_m, lag)
 
 
-def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
+def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -> Array:
     """Return the sum of all corrections, with which the output follows the state.
 
     ``offset`` o is the state minus the output without corrections. With gain g and error e_k =
@@ -87,26 +87,26 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_GAIN * g**2
-    delayed_offset = delay_by(offset - offset[0], lag)
+    delayed_offset = delay_by(offset - offset[0], lag_steps)
     correction_sum = _recursive_filter(
         np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), delayed_offset
     )
     return np.asarray(correction_sum + offset[0])
 
 
-def delay_by(values: Array, lag: int) -> Array:
+def delay_by(values: Array, lag_steps: int) -> Array:
     """Delay values by ``lag`` steps; the first value is repeated."""
-    return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
+    return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 
-def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
+def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: float) -> Array:
     """Return the sum of the attitude corrections of the output predictor.
 
     Each step corrects the attitude by 0.5 · step / horizon of ``error_rad``, the attitude error at
     the fusion horizon (rotation vectors, shape (n + 1, 3)).
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
-    numerator, denominator = np.zeros((2, lag + 2))
+    numerator, denominator = np.zeros((2, lag_steps + 2))
     numerator[-1] = gain
     denominator[:2] = (1.0, -1.0)
     denominator[-1] += gain

@@ -1,7 +1,8 @@
 """Result of an EKF2 replay, and its agreement with the log."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -217,7 +218,7 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Spans (s) of the replay without the first seconds and without times of flow only."""
+        """Spans (s) of the replay, without the first seconds and times with optical flow only."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -230,48 +231,46 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
         return tuple(spans)
 
 
+class _ComparedInnovations(NamedTuple):
+    """Logged and replayed innovations of the same samples, and their agreement by axis."""
+
+    logged: pd.DataFrame
+    replayed: pd.DataFrame
+    axes: dict[str, AxisAgreement]
+
+    @property
+    def rejected_fractions(self) -> tuple[float, float]:
+        logged, replayed = (float(np.mean(each["rejected"] > 0.0)) for each in self[:2])
+        return logged, replayed
+
+
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
     """Compare a replay (with logged parameters) with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    is_own_topic = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
-    log, model = _matched_samples(
-        replay, replay.updates, logged_innovations(ekf2), is_own_topic=is_own_topic
-    )
-    if len(log) < MIN_SAMPLES:
-        return Unavailable(
-            ANALYSIS_NAME,
-            f"the log contains only {count_noun(len(log), 'innovation')} in the replayed time (at "
-            f"least {MIN_SAMPLES} are needed)",
-            "Fly longer with the position source, and record with SDLOG_PROFILE bit 0 (default).",
-        )
     if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
-    if _has_constant_innovations(log, model, HORIZONTAL):
+    aid = replayed_aid(ekf2)
+    is_own_topic = aid_source(aid) in ekf2.innovation_topics
+    position = _compare_innovations(
+        ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
+    )
+    if isinstance(position, str):
         return Unavailable(
             ANALYSIS_NAME,
-            CONSTANT_INNOVATIONS,
-            "Record a flight with motion and real measurements.",
+            position,
+            "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    axes: dict[str, AxisAgreement]
-    axes = {axis: _axis_agreement(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
-    north = axes["north"]
-    east = axes["east"]
-    rejected_in_log, rejected_in_model = (
-        innovations["rejected"].to_numpy() > 0 for innovations in (log, model)
-    )
-    rejected_fractions = float(rejected_in_log.mean()), float(rejected_in_model.mean())
-    is_good, reason = _agreement_verdict(axes, *rejected_fractions)
-    other_agreements, doubtful_aids = _other_agreements(ekf2, replay)
-    velocity, constant = _velocity_agreement(ekf2, replay, is_own_topic=is_own_topic)
-    if constant:
+    rejected_in_log, rejected_in_replay = position.rejected_fractions
+    is_good, reason = _agreement_verdict(position.axes, rejected_in_log, rejected_in_replay)
+    agreements, doubtful_aids = _other_agreements(ekf2, replay)
+    velocity = _compare_velocity(ekf2, replay, is_own_topic)
+    if velocity == CONSTANT_INNOVATIONS:
         doubtful_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
-    position = {replayed_aid(ekf2).name: axes}
-    distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         doubtful_aids[FLOW.name] = (
@@ -279,21 +278,54 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             f"positions differ by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
+    is_same_decision = (position.logged["rejected"] > 0.0).to_numpy() == (
+        position.replayed["rejected"] > 0.0
+    )
+    distances_m = [axis.position_rms_difference_m for axis in position.axes.values()]
     return Agreement(
-        north=north,
-        east=east,
-        gnss_vel=velocity,
-        **(position | other_agreements),
+        north=position.axes["north"],
+        east=position.axes["east"],
+        gnss_vel={} if isinstance(velocity, str) else velocity.axes,
+        **(agreements | {aid.name: position.axes}),
         doubtful=doubtful_aids,
-        samples=len(log),
-        rejected_fraction_logged=rejected_fractions[0],
-        rejected_fraction_replayed=rejected_fractions[1],
-        decisions_same=float(np.mean(rejected_in_log == rejected_in_model)),
-        published_rms_difference_m=float(distance_m),
+        samples=len(position.logged),
+        rejected_fraction_logged=rejected_in_log,
+        rejected_fraction_replayed=rejected_in_replay,
+        decisions_same=float(np.mean(is_same_decision)),
+        published_rms_difference_m=math.hypot(*distances_m),
         good=is_good,
         reason=reason,
         heading_rms_difference_deg=_heading_error_deg(ekf2, replay),
         carried_difference_m=flow_only_m,
+    )
+
+
+def _compare_innovations(
+    ekf2: Ekf2,
+    replay: Ekf2Replay,
+    updates: pd.DataFrame,
+    logged: pd.DataFrame,
+    axes: Sequence[AxisName],
+    is_own_topic: bool,
+) -> _ComparedInnovations | str:
+    """Compare innovations in the evaluated times, or return the reason why this is impossible."""
+    matched_updates = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
+    is_used = (matched_updates >= 0) & inside_spans(logged.index, replay.evaluated_s)
+    # a sample to which EKF2 resets its state is logged with innovation 0
+    is_used &= logged.filter(regex="innovation_[a-z]+_m$").any(axis=1)
+    logged, updates = logged[is_used], updates.iloc[matched_updates[is_used]]
+    if len(logged) < MIN_SAMPLES:
+        return (
+            f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
+            f"(at least {MIN_SAMPLES} are needed)"
+        )
+    columns = [f"innovation_{axis}_m" for axis in axes]
+    if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
+        return CONSTANT_INNOVATIONS
+    return _ComparedInnovations(
+        logged,
+        updates,
+        {axis: _axis_agreement(axis, logged, updates, ekf2, replay) for axis in axes},
     )
 
 
@@ -323,81 +355,52 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     return float(np.degrees(rms(difference_rad)))
 
 
-def _has_constant_innovations(
-    logged_samples: pd.DataFrame, model_samples: pd.DataFrame, axes: Iterable[AxisName]
-) -> bool:
-    columns = [f"innovation_{axis}_m" for axis in axes]
-    return not all(
-        np.ptp(innovations[columns], axis=0).all()
-        for innovations in (logged_samples, model_samples)
-    )
-
-
-def _velocity_agreement(
-    ekf2: Ekf2, replay: Ekf2Replay, *, is_own_topic: bool
-) -> tuple[dict[str, AxisAgreement], bool]:
-    """Return the agreement of GNSS velocity, and True if innovations are constant.
-
-    The agreement is empty if velocity is not fused or not logged.
-    """
-    log = ekf2.aids.get("gnss_vel")
+def _compare_velocity(
+    ekf2: Ekf2, replay: Ekf2Replay, is_own_topic: bool
+) -> _ComparedInnovations | str:
+    log = ekf2.aids.get(GNSS_VEL.name)
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
-        return {}, False
-    logged_samples, model_samples = _matched_samples(
-        replay, replay.updates, log.samples, is_own_topic=is_own_topic
-    )
-    if len(logged_samples) < MIN_SAMPLES:
-        return {}, False
-    # give the velocity columns the names of position columns, which _axis_agreement reads
+        return "GNSS velocity is not fused or not logged"
+    # give the velocity columns the names of position columns
     names: dict[str, str] = {}
     for axis in AXIS_NAMES:
         nu = f"innovation_{axis}_m"
         S = f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
-    logged_samples = logged_samples.rename(columns=names)
-    model_samples = model_samples[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
-    # compare the axis down only if the replay fuses heights: else it uses the logged EKF2 height
-    axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
-    if _has_constant_innovations(logged_samples, model_samples, axes):
-        return {}, True
-    return {
-        axis: _axis_agreement(axis, logged_samples, model_samples, ekf2, replay) for axis in axes
-    }, False
+    return _compare_innovations(
+        ekf2,
+        replay,
+        replay.updates.filter([*VELOCITY_UPDATE_COLUMNS, "fused_at_s"]).rename(columns=names),
+        log.samples.rename(columns=names),
+        # without height fusion the replay uses the logged EKF2 height
+        AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL,
+        is_own_topic,
+    )
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the agreement of heights and of vision in addition to GNSS, and each disagreement."""
-    agreements: dict[str, dict[str, AxisAgreement]] = {}
+    agreements: dict[str, Any] = {}
     doubtful_aids = {}
     for name, updates in replay.other_aid_updates.items():
         log = ekf2.aids[name]
-        is_own_topic = aid_source(AIDS[name]) in log.topics
-        rows = logged_aid_innovations(name, log)
         # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
-        logged_samples, model_samples = _matched_samples(
-            replay, matched_updates, rows, is_own_topic=is_own_topic
+        compared = _compare_innovations(
+            ekf2,
+            replay,
+            matched_updates,
+            logged_aid_innovations(name, log),
+            axes_of(updates),
+            aid_source(AIDS[name]) in log.topics,
         )
-        if len(logged_samples) < MIN_SAMPLES:
-            doubtful_aids[name] = (
-                f"the log has only {count_noun(len(logged_samples), 'innovation')} in the replayed "
-                "time"
-            )
+        if isinstance(compared, str):
+            doubtful_aids[name] = compared
             continue
-        if _has_constant_innovations(logged_samples, model_samples, axes_of(updates)):
-            doubtful_aids[name] = CONSTANT_INNOVATIONS
-            continue
-        agreements[name] = {
-            axis: _axis_agreement(axis, logged_samples, model_samples, ekf2, replay)
-            for axis in axes_of(updates)
-        }
-        rejected_fractions = (
-            float(np.mean(innovations["rejected"] > 0.0))
-            for innovations in (logged_samples, model_samples)
-        )
-        is_good, reason = _agreement_verdict(agreements[name], *rejected_fractions)
+        agreements[name] = compared.axes
+        is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
         if not is_good:
             doubtful_aids[name] = reason
     return agreements, doubtful_aids
@@ -412,17 +415,6 @@ def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
 
 def axes_of(updates: pd.DataFrame) -> list[AxisName]:
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
-
-
-def _matched_samples(
-    replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, is_own_topic: bool
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the logged innovations in the evaluated times, and the updates of the same samples."""
-    matched_updates = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
-    is_used = (matched_updates >= 0) & inside_spans(logged.index, replay.evaluated_s)
-    # a sample to which EKF2 resets its state is logged with innovation 0
-    is_used &= logged.filter(regex="innovation_[a-z]+(_m)?$").any(axis=1)
-    return logged[is_used], updates.iloc[matched_updates[is_used]]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:

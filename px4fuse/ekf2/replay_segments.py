@@ -167,7 +167,7 @@ class ReplaySegment:
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias, from the published velocity.
-    metres : (float, float, float)
+    ekf2_metres_per_metre : (float, float, float)
         EKF2's internal metres per published metre.
     history : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
@@ -195,7 +195,7 @@ class ReplaySegment:
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
-    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ekf2_metres_per_metre: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "ReplaySegment | None" = None
     changed: Mapping[str, float] = record_field(default_factory=dict)
 
@@ -209,9 +209,11 @@ class ReplaySegment:
     @cached_property
     def imu_displacement_m(self) -> Array:
         """Displacement since the start from the IMU (m, NED), shape (n + 1, 3)."""
-        speed = self.imu_velocity_m_s
-        path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
-        return np.concatenate([np.zeros((1, 3)), path])
+        velocity = self.imu_velocity_m_s
+        displacement = np.cumsum(
+            0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None], axis=0
+        )
+        return np.concatenate([np.zeros((1, 3)), displacement])
 
 
 def samples_by_event(
@@ -249,9 +251,13 @@ def samples_by_event(
     measurement_step = measurement_step[:count]
     event_step = event_steps[event]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
-    path = segment.imu_displacement_m[:, axes]
-    speed = segment.imu_velocity_m_s[:, axes]
-    displacement = path[event_step] - path[measurement_step] - speed[event_step] * age_s[:, None]
+    displacement = segment.imu_displacement_m[:, axes]
+    velocity = segment.imu_velocity_m_s[:, axes]
+    displacement = (
+        displacement[event_step]
+        - displacement[measurement_step]
+        - velocity[event_step] * age_s[:, None]
+    )
     slot = np.arange(count) - np.searchsorted(event, event)
     position_m = position_m[:count] + displacement
     columns = *position_m.T, age_s, *(column[:count] for column in more), np.ones(count)
@@ -288,22 +294,22 @@ def find_replay_segments(
     fused_s = innovations.index.to_numpy()
     state_times_s = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
-    cuts = [time[0], time[-1]]
+    cut_times_s = [time[0], time[-1]]
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
-        gap = np.flatnonzero(np.diff(stamps) > limit)
-        cuts += [*stamps[gap], *stamps[gap + 1]]
-    cuts += _break_times_s(imu, ekf2) if is_gnss else ()
+        gap_rows = np.flatnonzero(np.diff(stamps) > limit)
+        cut_times_s += [*stamps[gap_rows], *stamps[gap_rows + 1]]
+    cut_times_s += _break_times_s(imu, ekf2) if is_gnss else ()
     first_s = max(attitude.index[0], source_s[0])
     end_s = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(record) if is_gnss else None
-    cuts += field_span[1:] if field_span else ()
+    cut_times_s += field_span[1:] if field_span else ()
     # another primary EKF2 instance has another state
-    cuts += [time_s for time_s, _ in ekf2.instances[1:]]
+    cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
-    cuts += [change.time_s for change in changes]
+    cut_times_s += [change.time_s for change in changes]
     segments = []
-    for low, high in pairwise(np.unique(np.clip(cuts, first_s, end_s))):
+    for low, high in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
         fused_inside = fused_s[(fused_s >= low) & (fused_s <= high)]
         if not len(fused_inside):
             continue
@@ -348,9 +354,9 @@ def _make_gnss_segment(
 ) -> ReplaySegment:
     """Make a segment with earth rotation, EKF2's internal metres and bad accelerations."""
     segment = _make_segment(imu, attitude, ekf2, record, start_row, end_s)
-    metres = ekf2_metres_per_metre(record)
+    metres_per_metre = ekf2_metres_per_metre(record)
     state = segment.state.copy()
-    state[POSITION] *= metres
+    state[POSITION] *= metres_per_metre
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
     start_s, end_s = segment.time_s[[0, -1]]
     velocity = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
@@ -358,7 +364,7 @@ def _make_gnss_segment(
     return replace(
         segment,
         state=state,
-        metres=metres,
+        ekf2_metres_per_metre=metres_per_metre,
         correction_rad=segment.correction_rad + earth_rotation_rad,
         clipped_fraction=_clipped_fraction(imu, segment.time_s),
         mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
@@ -367,7 +373,7 @@ def _make_gnss_segment(
 
 def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) at which the replay must be interrupted: clipping and height resets."""
-    breaks = [
+    break_times_s = [
         time
         for reset in ekf2.resets
         if reset.delta[2]
@@ -380,8 +386,8 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         clipped_moments = clipped_s[
             end - begin > MAX_CLIPPED_FRACTION / float(np.median(np.diff(times)))
         ]
-        breaks += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
-    return breaks
+        break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
+    return break_times_s
 
 
 def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:

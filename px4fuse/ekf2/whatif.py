@@ -166,12 +166,10 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     @property
     def position_rmse_to_truth_m(self) -> float | Unavailable:
         """Horizontal RMSE of the published position against ground truth (m)."""
-        squares = 0.0
-        for axis in self.axes.values():
-            if isinstance(axis.position_rmse_to_truth_m, Unavailable):
-                return axis.position_rmse_to_truth_m
-            squares += axis.position_rmse_to_truth_m**2
-        return float(np.sqrt(squares))
+        north_m, east_m = self.north.position_rmse_to_truth_m, self.east.position_rmse_to_truth_m
+        if isinstance(north_m, Unavailable):
+            return north_m
+        return east_m if isinstance(east_m, Unavailable) else float(np.hypot(north_m, east_m))
 
 
 @dataclass(frozen=True)
@@ -266,17 +264,17 @@ def what_if(
 
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     difference_deg = model.agreement.heading_rms_difference_deg
-    heading = HEADING_LOGGED_NOTE
+    heading_note = HEADING_LOGGED_NOTE
     if difference_deg is not None:
-        heading = (
+        heading_note = (
             "Heading is replayed with the magnetometer (with the logged parameters it differs from "
             f"the log by {difference_deg:.1f}° RMS)"
         )
-    height = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
+    height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
     is_bad = model.inputs.segments[0].is_acceleration_bad
-    if height == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
-        height += HEIGHT_START_NOTE
-    return heading, height
+    if height_note == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
+        height_note += HEIGHT_START_NOTE
+    return heading_note, height_note
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:
@@ -558,7 +556,7 @@ def _deviation_note(
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
-    height = (
+    height_note = (
         f". The published height differs by at most {down.max():.3g} m"
         if heights & {*replays_without}
         else ""
@@ -571,7 +569,7 @@ def _deviation_note(
     return (
         f"Without {aids_text} the published position differs from the replay with all aiding "
         f"sources by at most {distance.max():.3g} m (at {at_s:.1f} s), and by "
-        f"{distance[-1]:.3g} m at the end{height}"
+        f"{distance[-1]:.3g} m at the end{height_note}"
         + (give_up_note if horizontal_aids <= replays_without.keys() else "")
     )
 

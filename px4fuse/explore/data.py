@@ -52,7 +52,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
             axis_signals | _axis_data(analysis, result, packer)
             for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
-        "maps": _map_data(analysis),
+        "likely": _likely_noises(analysis),
         "events": {
             "gap": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -180,7 +180,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
         "ratios": [verdict.ratio for verdict in verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
-        "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
+        # horizontal axes share their noise estimates if they exist
+        "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
         "ekf2": _ekf2_data(analysis, result.in_flight, packer),
         "truth": _truth_data(result.in_flight, packer),
     }
@@ -263,16 +264,12 @@ def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
-def _map_data(analysis: Analysis) -> Data:
-    """Return the noise estimates of each likelihood map, or the reason why they are missing."""
+def _likely_noises(analysis: Analysis) -> Data:
+    """Return the maximum-likelihood estimates of SIGMA_A and SIGMA_Z by axis."""
     return {
-        name: {
-            "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
-            "count": axis_tuning.count,
-        }
-        if isinstance(axis_tuning, AxisTuning)
-        else axis_tuning.reason
+        name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
         for name, axis_tuning in analysis.tuning.items()
+        if isinstance(axis_tuning, AxisTuning)
     }
 
 

@@ -3,17 +3,18 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import numpy as np
 from bokeh.document import Document
-from bokeh.models import ColumnDataSource, FactorRange, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import (
+    ColumnDataSource,
+    FactorRange,
+    HoverTool,
+    Range1d,
+)
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.analysis import Analysis
-from px4fuse.core.arrays import Array
 from px4fuse.core.record import Record, table
 from px4fuse.explore.data import Data
-from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 
 # Options of a drawing function of Bokeh
 Style = dict[str, Any]
@@ -51,8 +52,6 @@ STYLES = {
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Distance (σ) from the maximum of the likelihood at which the map has its palest colour
-MAP_SIGMAS = 6.0
 
 
 class Plot(Record, frozen=True):
@@ -80,7 +79,6 @@ class Figures(Record, frozen=True):
     """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]
-    map_colours: list[str]
     views: dict[str, View]
     plots: dict[str, Plot]
 
@@ -88,14 +86,13 @@ class Figures(Record, frozen=True):
 FIGURES = table(__file__, "figures.toml", Figures)
 
 
-def document_json(data: Data, analysis: Analysis) -> tuple[Any, dict[str, str]]:
+def document_json(data: Data) -> tuple[Any, dict[str, str]]:
     """Return Bokeh's document with all plots, and the name of each plot by its id."""
     document = Document()
     time_range = _page_range("time")
     plots = _make_plots(data, time_range)
     plots |= {
         "strip": _event_plot(data, time_range),
-        "map": _likelihood_map(analysis),
         "step": _phase_plot(),
     }
     with document.models.freeze():  # Bokeh collects all models once, which is faster
@@ -232,46 +229,9 @@ def _event_plot(data: Data, time_range: Range1d) -> Any:
     return fig
 
 
-def _likelihood_map(analysis: Analysis) -> Any:
-    """Make the map of the log-likelihood over SIGMA_A and SIGMA_Z, with the current settings."""
-    fig = _figure(
-        "map",
-        250,
-        x_axis_type="log",
-        y_axis_type="log",
-        tools="tap",
-        x_axis_label="SIGMA_A (m/s²)",
-        y_axis_label="SIGMA_Z (m)",
-    )
-    fig.x_range.only_visible = fig.y_range.only_visible = True
-    mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
-    for name, axis_tuning in analysis.tuning.items():
-        if isinstance(axis_tuning, AxisTuning):
-            grids = map_grids(axis_tuning)
-            (x, dw), (y, dh) = map(_pixel_extent, grids)
-            kf_axes = (result.axis for result in analysis.axes.values())
-            decrease = log_likelihood_drop(axis_tuning, kf_axes, analysis.settings, *grids)
-            # rows: SIGMA_Z, columns: SIGMA_A
-            image = np.sqrt(2.0 * decrease.T).astype(np.float32)
-            draw: Any = fig.image  # color_mapper is missing in its type signature
-            draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    style: Style = {"line_color": "white"}
-    _draw_dots(fig, _empty_source("best"), "x y", 13, marker="cross", line_width=2.5, **style)
-    current = _empty_source("point")
-    _draw_dots(fig, current, "x y", 12, fill_color="darkorange", line_width=2.0, **style)
-    return fig
-
-
 def _draw_dots(fig: Any, source: ColumnDataSource, columns: str, size: int, **style: Any) -> Any:
     x, y = columns.split()
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
-
-
-def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Return start and length of an image from its logarithmically spaced pixel centres."""
-    half_pixel = float(np.sqrt(values[1] / values[0]))
-    start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
-    return start, end - start
 
 
 def _phase_plot() -> Any:

@@ -11,9 +11,9 @@ const Explore = (async () => {
   // `log`: ends of a logarithmic slider; a slider without `log` is linear. `likely`: maximum-likelihood estimate
   const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
-      hint: "process noise", likely: () => mapNow().likely?.[0] },
+      hint: "process noise", likely: () => likelyNow()[0] },
     { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
-      hint: "measurement noise", likely: () => mapNow().likely?.[1] },
+      hint: "measurement noise", likely: () => likelyNow()[1] },
     { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
       hint: "added to timestamps", likely: () => flight.offset.likely },
     { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
@@ -87,7 +87,7 @@ const Explore = (async () => {
   }
   const axisNow = () => axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
-  const mapNow = () => flight.maps[axisNow().map] ?? "not computed for this axis";
+  const likelyNow = () => flight.likely[axisNow().noises] ?? [null, null];
 
   onClick("lesson", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
@@ -95,7 +95,7 @@ const Explore = (async () => {
     showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
-    const [sigmaA, sigmaZ] = mapNow().likely;
+    const [sigmaA, sigmaZ] = likelyNow();
     set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
     showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
@@ -393,31 +393,6 @@ const Explore = (async () => {
     }
   }
 
-  // ------------------------------------------------------------------ likelihood map
-  let mapShown = null;
-  function drawMap() {
-    const map = mapNow(), plot = model("map");
-    $("map").hidden = isText(map);
-    if (isText(map)) return;
-    const name = axisNow().map;
-    if (mapShown !== name) {
-      mapShown = name;
-      for (const item of plot.renderers) {
-        if (item.name?.startsWith("map:")) item.visible = item.name === `map:${name}`;
-      }
-      const [a, z] = map.likely;
-      setSource("best", map.likely.includes(null) ? { x: [], y: [] } : { x: [a], y: [z] });
-    }
-    setSource("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
-  }
-  function mapNote() {
-    const map = mapNow(), initial = flight.settings;
-    if (isText(map)) return `The likelihood map is missing: ${map}.`;
-    const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
-    const differs = ["dt", "offset", "input"].some((key) => initial[key] !== settings[key]);
-    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset ${round(initial.offset, 4)} s. Darker colours: higher likelihood, in steps of 0.5 σ. Cross: maximum. Dot: current settings.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
-  }
-
   // ------------------------------------------------------------------ command
   function command() {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
@@ -452,17 +427,15 @@ const Explore = (async () => {
     if (result.run) drawKf(result);
     drawCard(result);
     drawTitles(result);
-    if (isVisible("map")) drawMap();
     if (quick) return;
     for (const name of ["axis", "input"]) {
       for (const radio of queryAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
-    const { axis } = result, map = mapNow();
+    const { axis } = result;
     $("along").textContent = `· ${axis.along}`;
     $("axis-note").textContent = axis.note;
-    $("likely").disabled = isText(map) || map.likely.includes(null);
+    $("likely").disabled = likelyNow().includes(null);
     $("ekf2-r").disabled = isText(axis.ekf2) || axis.ekf2.r === null;
-    $("map-note").textContent = mapNote();
     drawTable(result);
     $("command").textContent = command();
     if (isNewAxis) times.drawEvents(axis);

@@ -36,7 +36,7 @@ def html_text(analysis: Analysis) -> str:
 
 def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
     """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
-    document, places = document_json(data, analysis)
+    document, places = document_json(data)
     content = {"flight": data, "ranges": ranges(), "packed": packer.array_specs, "places": places}
     figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
     return figures + "\n".join(

@@ -78,7 +78,7 @@ const Times = (() => {
     function paint() {
       const style = getComputedStyle(document.documentElement);
       const colours = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`)]));
-      for (const plot of [...figures, ...["map", "step"].map(model)]) {
+      for (const plot of [...figures, model("step")]) {
         for (const item of plot.center) {
           if (item.type !== "Grid") item.line_color = { cursor: colours.ink, measurement: colours.measured, consistent: colours.band }[item.name] ?? null;
           if (item.name === "band") item.fill_color = colours.measured;
@@ -89,7 +89,6 @@ const Times = (() => {
     }
     function colour(name, glyph, colours) {
       if (name === "kf_band") { glyph.fill_color = colours.kf; return; }
-      if (name === "ink") { glyph.text_color = colours.ink; return; }
       if (name === null || colours[name] === undefined) return;
       const hasColour = (property) => Boolean(property?.value === undefined ? property : property.value);
       if (hasColour(glyph.line_color)) glyph.line_color = colours[name];

@@ -301,7 +301,7 @@ def maximise_likelihood(
     """
     outlier_probability = np.zeros_like(weight)
     outlier_share = START_OUTLIER_FRACTION
-    width = START_OUTLIER_WIDTH
+    outlier_width = START_OUTLIER_WIDTH
     noises = start
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
@@ -316,15 +316,15 @@ def maximise_likelihood(
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        probability = _outlier_probability(squares / variance, count, outlier_share, width)
+        probability = _outlier_probability(squares / variance, count, outlier_share, outlier_width)
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
         outlier_share = float(
             np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_FRACTION)
         )
         outlier_square = np.sum(probability * squares) / max(np.sum(probability * count), 1e-9)
-        width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
-        weight = 1.0 - probability * (1.0 - width**-2.0)
+        outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
+        weight = 1.0 - probability * (1.0 - outlier_width**-2.0)
         change = np.abs(probability - outlier_probability)
         outlier_probability = probability
         if change.max() < MAX_PROBABILITY_CHANGE:
@@ -336,7 +336,7 @@ def maximise_likelihood(
     if outlier_probability.any():
         squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
         sigma_z_variance_factor = outlier_variance_factor(
-            squares / noises.sigma_z_m**2, count, outlier_probability, width
+            squares / noises.sigma_z_m**2, count, outlier_probability, outlier_width
         )
     return NoiseFit(noises, weight, outlier_probability, likelihood, sigma_z_variance_factor)
 
@@ -357,14 +357,14 @@ def _expected_squares_of_axes(
 
 
 def _outlier_probability(
-    expected_squares: Array, count: Array, outlier_share: float, width: float
+    expected_squares: Array, count: Array, outlier_share: float, outlier_width: float
 ) -> Array:
-    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(width)
-    return np.asarray(expit(log_odds + 0.5 * expected_squares * (1.0 - width**-2.0)))
+    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(outlier_width)
+    return np.asarray(expit(log_odds + 0.5 * expected_squares * (1.0 - outlier_width**-2.0)))
 
 
 def outlier_variance_factor(
-    square: Array, count: Array, outlier_probability: Array, width: float
+    square: Array, count: Array, outlier_probability: Array, outlier_width: float
 ) -> float:
     """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
 
@@ -374,7 +374,7 @@ def outlier_variance_factor(
     """
     outlier_share = np.mean(outlier_probability)
     sigma_information = 2.0 * float(np.sum(count))
-    inverse_square_width = width**-2.0
+    inverse_square_width = outlier_width**-2.0
     complete_information = np.zeros((3, 3))
     complete_information[:2, :2] = 2.0 * np.sum(count * outlier_probability)
     complete_information[0, 0] = sigma_information
@@ -399,7 +399,7 @@ def _maximise_by_gradient(
     likelihood: Likelihood, start: Noises, max_steps: int = MAX_ITERATIONS
 ) -> Noises:
     values = {name: value for name, value in vars(start).items() if value}
-    bounds = np.log([SEARCH_RANGES[name] for name in values])
+    log_bounds = np.log([SEARCH_RANGES[name] for name in values])
     count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
@@ -416,9 +416,9 @@ def _maximise_by_gradient(
 
     result = minimize(
         score_per_measurement,
-        np.clip(np.log([*values.values()]), *bounds.T),
+        np.clip(np.log([*values.values()]), *log_bounds.T),
         method="L-BFGS-B",
-        bounds=bounds.tolist(),
+        bounds=log_bounds.tolist(),
         options={"eps": DERIVATIVE_LOG_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
     )
     return to_noises(result.x)

@@ -289,9 +289,9 @@ def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
     gaps = np.flatnonzero(imu_gaps(imu_s))
-    begins = np.maximum(imu_s[np.r_[0, gaps + 1]], attitude_s[0])
+    starts_s = np.maximum(imu_s[np.r_[0, gaps + 1]], attitude_s[0])
     ends = np.minimum(imu_s[np.r_[gaps, len(imu_s) - 1]], attitude_s[-1])
-    return list(zip(begins.tolist(), ends.tolist(), strict=True))
+    return list(zip(starts_s.tolist(), ends.tolist(), strict=True))
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signals:

@@ -7,13 +7,12 @@ SIGMA_Z of at least 1e-3 the results equal those of :func:`px4fuse.filter.kalman
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
@@ -128,51 +127,27 @@ def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
 
 def innovations(
     intervals: Preintegrated,
-    sigma_a_m_s2: ArrayLike,
-    sigma_z_m: ArrayLike,
+    sigma_a_m_s2: float,
+    sigma_z_m: float,
     is_skipped: BoolArray | None = None,
 ) -> ArrayPair:
-    """Compute innovations (m) and innovation variances (m²) of KF for a grid of settings.
+    """Run KF; return ν (m) and S (m²) of each measurement, shape (m,).
 
-    For the parameters see :func:`run_filter`. Both results have the shape (m, ...) for a grid of
-    shape (...). With k columns of input and one pair of settings, the shapes are (m, k) and (m,).
-    """
-    nu, s = zip(*run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped), strict=True)
-    return np.array(nu), np.array(s)
-
-
-def run_filter(
-    intervals: Preintegrated,
-    sigma_a_m_s2: ArrayLike,
-    sigma_z_m: ArrayLike,
-    is_skipped: BoolArray | None,
-    weight: Array | None = None,
-) -> Iterator[ArrayPair]:
-    """Run KF for a grid of settings; yield ν (m) and S (m²) of each measurement.
-
-    With one pair of settings, Δp, Δv and the measurements may have k columns, shape (m, k). KF is
-    linear, so k inputs can be filtered with the same gains.
+    Δp, Δv and the measurements may have k columns; then ν has the shape (m, k). KF is linear, so k
+    inputs can be filtered with the same gains.
 
     Parameters
     ----------
     intervals : Preintegrated
-    sigma_a_m_s2, sigma_z_m : array_like
-        Broadcast against each other to a grid.
-    is_skipped : ndarray of bool, shape (m,), or None
+    sigma_a_m_s2, sigma_z_m : float
+    is_skipped : ndarray of bool, shape (m,), optional
         Measurements with an innovation but without an update.
-    weight : ndarray, shape (m,), optional
-        The variance of a measurement is SIGMA_Z² / weight.
     """
-    squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
-    q, r = np.broadcast_arrays(*squares)
-    if not q.ndim:  # floats are fifty times faster than arrays of a single element
-        q = q.item()
-        r = r.item()
-    p = intervals.initial.position_m
-    v = intervals.initial.velocity_m_s + 0.0 * q  # adding 0 · q gives the shape of the grid
+    q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
+    p, v = intervals.initial.position_m, intervals.initial.velocity_m_s
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
-    sigma_z_squared = r
-    for dt, dp, dv, noise_unit, noise_fixed, z, skips_update, weight_k in zip(
+    rows = []
+    for dt, dp, dv, noise_unit, noise_fixed, z, skips_update in zip(
         intervals.length_s.tolist(),
         _values_by_measurement(intervals.delta_position_m),
         _values_by_measurement(intervals.delta_velocity_m_s),
@@ -180,10 +155,8 @@ def run_filter(
         intervals.noise_fixed.tolist(),
         _values_by_measurement(intervals.measurement_m),
         [False] * len(intervals.measurement_m) if is_skipped is None else is_skipped.tolist(),
-        [1.0] * len(intervals.measurement_m) if weight is None else weight.tolist(),
         strict=True,
     ):
-        r = sigma_z_squared / weight_k
         # x = Fx + Ba, P = FPFᵀ + Q
         p = p + dt * v + dp
         v = v + dv
@@ -195,26 +168,14 @@ def run_filter(
         (nu, s, _, _), updated_state = update_step(p, v, covariance, z, r)
         if not skips_update:
             p, v, covariance = updated_state
-        yield nu, s
+        rows.append((nu, s))
+    nu, s = map(np.array, zip(*rows, strict=True))
+    return nu, s
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
     """Return a list of numbers, or of arrays with k columns."""
     return values.tolist() if values.ndim == 1 else list(values)
-
-
-def score_grid(
-    intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
-) -> Array:
-    """Return KF's -ln p of all axes (without a constant) on a grid of settings.
-
-    The variance of a measurement is SIGMA_Z² / weight.
-    """
-    total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
-    for interval in intervals:
-        for nu, s in run_filter(interval, sigma_a_m_s2, sigma_z_m, None, weight):
-            total += 0.5 * (np.log(s) + nu**2 / s)
-    return total
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
@@ -228,21 +189,18 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     return (0.5 * (left_value - right_value) / curvature if curvature > 0.0 else 0.0), curvature
 
 
-def profile_interval(
-    grid: Array, profile: Array, max_drop: float = PROFILE_DROP
-) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of a parameter; None for an end outside the grid.
+def profile_interval(grid: Array, profile: Array) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of a parameter from its negative log-likelihood on a grid.
 
-    ``profile`` is the negative log-likelihood on the grid; it increases by ``max_drop`` from its
-    minimum to the ends of the interval.
+    An end outside the grid is None.
     """
     drop = profile - profile.min()
-    first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
+    first_index, last_index = np.flatnonzero(drop <= PROFILE_DROP)[[0, -1]]
 
     def interpolate_end(inside_index: int, outside: int) -> float | None:
         if not 0 <= outside < len(grid):
             return None
-        fraction = (max_drop - drop[inside_index]) / (drop[outside] - drop[inside_index])
+        fraction = (PROFILE_DROP - drop[inside_index]) / (drop[outside] - drop[inside_index])
         return float(grid[inside_index] + fraction * (grid[outside] - grid[inside_index]))
 
     return interpolate_end(first_index, first_index - 1), interpolate_end(

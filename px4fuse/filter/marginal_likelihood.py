@@ -22,7 +22,7 @@ Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constan
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -40,8 +40,6 @@ MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise (σ) that each interval adds, relative to the measurement noise and to Q: it
 # makes a singular Q invertible
 MIN_NOISE_RATIO = 1e-5
-# Number of signals per computation: more need more memory and are not faster
-SIGNAL_BATCH_SIZE = 8
 # Smaller determinants of Q, relative to the product of its diagonal, are rounding errors
 MIN_DETERMINANT_RATIO = 1e-12
 
@@ -204,18 +202,11 @@ class FittedPositions:
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
 
-def fit_positions(
-    positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
-) -> FittedPositions:
-    """Fit positions with one SIGMA_A; ``variance_m2``, shape (m,), are the measurement variances.
-
-    ``measured_m``, shape (a, 1 or T, 1 + c, m), replaces the measured positions by other data,
-    followed by their sensitivity to each constant.
-    """
-    if measured_m is None:
-        measurement_count, axes = positions.measurement_m.shape
-        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), measurement_count))
-        measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
+def fit_positions(positions: Positions, sigma_a_m_s2: float, variance_m2: Array) -> FittedPositions:
+    """Fit positions with one SIGMA_A and the variance of each measurement, shape (m,)."""
+    measurement_count, axes_count = positions.measurement_m.shape
+    measured_m = np.zeros((axes_count, 1, 1 + len(positions.constant_sigma), measurement_count))
+    measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
@@ -299,60 +290,6 @@ def expected_squares(
     return square_m2, np.isfinite(positions.measurement_m).sum(axis=1)
 
 
-def products_by_segment(
-    positions: Positions,
-    sigma_a_m_s2: float,
-    variance_m2: Array,
-    signals: Sequence[Array],
-    measured_m: Array,
-) -> Array:
-    """Return the inner product of each of k signals with a second signal, shape (s, k).
-
-    Parameters
-    ----------
-    positions : Positions
-        Positions with one time offset.
-    sigma_a_m_s2 : float
-    variance_m2 : ndarray, shape (m,)
-        Variance of each measurement.
-    signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
-        Measurements, Δp and Δv of the first signals.
-    measured_m : ndarray, shape (a, k, m)
-        Measurements of the second signals, which have no Δp and Δv.
-    """
-    first_measured_m, *increments = signals
-    constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
-    results = []
-    for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
-        batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # order: first signals, second signals, sensitivities to the constants
-        dp, dv = (
-            np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
-                :, None
-            ]
-            for increment, constant_signal in zip(increments, constants, strict=True)
-        )
-        measured = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
-        first_rows, second_rows, constant_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
-        )
-        measured[:, 0, first_rows] = first_measured_m[batch]
-        measured[:, 0, second_rows] = measured_m[batch]
-        all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
-        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
-        information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
-            positions.constant_sigma**-2.0
-        )
-        constant_coefficients = np.linalg.solve(
-            information, gram[:, constant_rows[:, None], second_rows]
-        )
-        by_constants = np.einsum(
-            "skc,sck->sk", gram[:, first_rows[:, None], constant_rows], constant_coefficients
-        )
-        results.append(gram[:, first_rows, second_rows] - by_constants)
-    return np.concatenate(results, axis=1)
-
-
 @dataclass(frozen=True)
 class BandedSystem:
     """Factorised normal equations of the states at all measurement times.
@@ -367,7 +304,7 @@ class BandedSystem:
         Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
         1/√Q₁₁; zero between segments.
-    bands, lower : ndarray, shape (2 + states, states · m)
+    bands, cholesky_factor : ndarray, shape (2 + states, states · m)
         Matrix A and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
         ln|A| + Σ ln|Q| - Σ ln precision.
@@ -378,7 +315,7 @@ class BandedSystem:
     inverse_q: Array
     inverse_sqrt_q11: Array
     bands: Array
-    lower: Array
+    cholesky_factor: Array
     log_determinant: float
 
     @property
@@ -406,13 +343,13 @@ class BandedSystem:
             Component of the signals that the states explain.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
-        explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
+        explained, _ = lapack.dtbtrs(self.cholesky_factor, right_side.T, uplo="L", overwrite_b=1)
         return intervals, explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
         _, right_side = self._interval_sides(measured_m, dp, dv)
-        state, _ = lapack.dpbtrs(self.lower, right_side.T, lower=1, overwrite_b=1)
+        state, _ = lapack.dpbtrs(self.cholesky_factor, right_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
@@ -452,8 +389,8 @@ class BandedSystem:
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        (a, c) = (self.lower[0, first_row::2] for first_row in (0, 1))
-        b = self.lower[1, 0::2]
+        (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
+        b = self.cholesky_factor[1, 0::2]
         # the reversed order also exchanges position and velocity
         (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
@@ -536,12 +473,18 @@ def factorise(
         correlated[:-1, state_count] = -rho / correlated_variance[1:]
         log_noise += np.sum(np.log(correlated_variance))
     bands = columns.reshape(-1, state_count + 2).T
-    lower, is_singular = lapack.dpbtrf(bands, lower=1)
+    cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
         raise np.linalg.LinAlgError("a segment has too few positions to determine an initial state")
-    log_lower = 2.0 * np.sum(np.log(lower[0]))
-    log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
+    log_factor = 2.0 * np.sum(np.log(cholesky_factor[0]))
+    log_determinant = log_factor + log_noise - np.sum(np.log(precision[precision > 0.0]))
     inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(
-        precision, length_s, inverse_q, inverse_sqrt_q11, bands, lower, float(log_determinant)
+        precision,
+        length_s,
+        inverse_q,
+        inverse_sqrt_q11,
+        bands,
+        cholesky_factor,
+        float(log_determinant),
     )

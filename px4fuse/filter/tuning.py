@@ -7,20 +7,19 @@ states for biases and needs a larger SIGMA_A, which is estimated separately.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
-    START_OUTLIER_WIDTH,
     NoiseFit,
     Noises,
     filter_positions,
@@ -32,7 +31,6 @@ from px4fuse.filter.likelihood import (
     innovations,
     preintegrate,
     profile_ends,
-    score_grid,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
@@ -40,10 +38,6 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Number of grid points along each side of the likelihood map
-GRID_SIZE = 40
-# Half-width of the likelihood map along each side, in σ of the estimate
-MAP_HALF_WIDTH_SIGMAS = 4.5
 # Minimum number of positions for an estimate of the noises
 MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
@@ -189,7 +183,11 @@ def tune(
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+            try:
+                tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+            except np.linalg.LinAlgError as error:  # positions far outside of the track
+                what = f"estimate of the noises ({name})"
+                tunings[name] = Unavailable(what, str(error), "Remove positions far from the path.")
     return tunings
 
 
@@ -215,15 +213,12 @@ def tune_axes(
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF's fit has no weight for the first measurement, its initial state
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
-        axis_directions = np.array([axis.direction for axis in axes])
-        time_s = axes[0].measurement_time_s
-        dt_s = settings.dt_s
         prepared_motion = prepare_motion(
             flight,
-            time_s,
+            axes[0].measurement_time_s,
             measured_m,
-            directions=axis_directions,
-            dt_s=dt_s,
+            directions=np.array([axis.direction for axis in axes]),
+            dt_s=settings.dt_s,
             weight=weight,
             signals=signals,
         )
@@ -279,8 +274,8 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
-        pair = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
-        sigma_a, sigma_z = np.exp(pair).tolist()
+        log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
+        sigma_a, sigma_z = np.exp(log_noises).tolist()
         return fit.score(Noises(sigma_a, sigma_z, fit.noises.random_walk_m))
 
     search_range = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]
@@ -315,41 +310,6 @@ def _noise_with_interval(
     )
     is_closed = low is not None and high is not None
     return Noise(value if is_inside and is_closed else None, low, high)
-
-
-def map_grids(tuning: AxisTuning) -> ArrayPair:
-    """Return SIGMA_A (m/s²) and SIGMA_Z (m) around their estimates, for a likelihood map."""
-    grids = []
-    for noise, fitted, (low, high) in (
-        (tuning.sigma_a_two_state, tuning.noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
-        (tuning.sigma_z, tuning.noises.sigma_z_m, SIGMA_Z_SEARCH_M),
-    ):
-        best_value = noise.value or noise.high or fitted
-        interval = np.array([noise.low or low, noise.high or high])
-        ends = best_value * (interval / best_value) ** (MAP_HALF_WIDTH_SIGMAS / 1.96)
-        lowest, highest = np.clip(ends, low, high)
-        grids.append(np.geomspace(lowest, highest, GRID_SIZE))
-    return grids[0], grids[1]
-
-
-def log_likelihood_drop(
-    tuning: AxisTuning,
-    axes: Iterable[Axis],
-    settings: Settings,
-    sigma_a_m_s2: Array,
-    sigma_z_m: Array,
-) -> Array:
-    """Return the decrease of KF's log-likelihood from its maximum on a grid.
-
-    Rows are SIGMA_A, columns SIGMA_Z.
-    """
-    names = ("north", "east") if tuning.name == HORIZONTAL else (tuning.name,)
-    tuned_axes = [axis for axis in axes if axis.name in names]
-    intervals = [preintegrate(axis, settings) for axis in tuned_axes]
-    time_s = tuned_axes[0].measurement_time_s[-len(intervals[0].measurement_m) :]
-    weight = np.where(np.isin(time_s, tuning.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
-    scores = score_grid(intervals, sigma_a_m_s2[:, None], sigma_z_m[None, :], weight)
-    return np.asarray(scores - scores.min())
 
 
 def _assess_innovations(

@@ -32,7 +32,7 @@ CHECKS = {
     "EKF2_RNG_CTRL": "Fly within the range of the distance sensor.",
     "EKF2_OF_CTRL": "Fly over a textured and lit floor.",
     "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
-    "EKF2_EV_CTRL": "Restore line of sight and link of the position source.",
+    "EKF2_EV_CTRL": "Check the position source and its data link.",
 }
 OTHER_CHECK = "Check mounting and power supply of the sensor."
 
@@ -106,7 +106,7 @@ def detect_in_aids(
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
         is_barometer, effect = switch == BAROMETER.switch, ""
         if is_barometer and height_error_m is not None:
-            effect = f". EKF2's height error is {height_error_m:.2f} m"
+            effect = f": EKF2's height error is {height_error_m:.2f} m"
         yield finding(
             "note" if is_barometer and not effect else "warning",
             "aid_not_fused",

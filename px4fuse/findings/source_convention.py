@@ -20,11 +20,10 @@ from px4fuse.convention.texts import (
     format_axes,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE, WRONG_IMU
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
-CORRECT_FIRST = "Correct the {} first."
 # Findings that are withdrawn if the source has a wrong convention
 FALSE_AFTER = (
     "ekf2_noise_too_small",
@@ -37,7 +36,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Findings that remain true if the source has a wrong convention; their action is CORRECT_FIRST
+# Findings that remain true if the source has a wrong convention, as effects of it
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -84,10 +83,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             for item in findings
             if item in unusable
             or item.id in EFFECTS
-            or (
-                CATALOGUE[item.id].group in UNAFFECTED_GROUPS
-                and (item.id != "accelerometer_bias" or unusable[0].id not in WRONG_IMU)
-            )
+            or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         root_findings = []
@@ -102,9 +98,8 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             *root_findings,
             *(item for item in others if item.id in EFFECTS or item.severity == "note"),
         ]
-    action = CORRECT_FIRST.format("IMU" if root_findings[0].id in WRONG_IMU else "position source")
     effects = [
-        replace(item, message=f"{item.title}.", remedy=action, caused_by=root_findings[0].id)
+        replace(item, message=f"{item.title}.", caused_by=root_findings[0].id)
         for item in others
         if item.id in EFFECTS and item.caused_by is None
     ]
@@ -133,7 +128,7 @@ def _position_faults(
     stated_frame = alignment.frame.upper() if alignment else "NED"
     axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
     is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
-    if faults.axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
+    if faults.has_wrong_axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
         orientation = convention.orientation
         limit = "The analysis uses the positions converted to NED."
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
@@ -142,7 +137,7 @@ def _position_faults(
         fault, action = describe_axes(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
         )
-        if faults.axes and turn_deg:
+        if faults.has_wrong_axes and turn_deg:
             fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
@@ -163,7 +158,7 @@ def _position_faults(
         if is_file:
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
-    if faults.unit:
+    if faults.has_wrong_unit:
         fault, action = describe_unit(convention.unit, positions, is_file=is_file)
         factor = convention.scale / UNITS[convention.unit]
         message = (

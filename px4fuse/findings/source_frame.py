@@ -11,7 +11,7 @@ from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_of, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
@@ -27,9 +27,9 @@ LARGE_HEADING_ERROR_DEG = 15.0
 MIN_TRUE_DRIFT_FRACTION = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
-# EKF2_MAG_TYPE without magnetometer
-NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
+# Bit of EKF2_EV_CTRL that fuses the yaw of the source
+YAW_CONTROL = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
@@ -61,13 +61,15 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
         detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
+    has_yaw = analysis.source.orientation is not None
     if detail:
         return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
         f"{fault} EKF2 did not fuse the yaw of {name}. The IMU is rotated into NED, so the axes of "
         "positions and IMU may differ.",
-        "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
+        "Send the position in NED"
+        + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
     )
 
 
@@ -157,15 +159,21 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     basis = "positions and IMU"
     if heading.by == "orientation":
         basis = f"the orientation of {source_name(analysis.source)}"
-    possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = _calibrate(analysis)
+    calibrate, has_yaw = _calibrate(analysis), analysis.source.orientation is not None
+    causes = [
+        "a magnetometer indoors" if calibrate else "a gyroscope bias",
+        *(["odometry whose heading drifts"] if has_yaw else []),
+    ]
+    possible_cause, action = ", or ".join(causes), ""
+    is_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL
+    let = "Or let" if calibrate else "Let"
+    if has_yaw and not is_fused:
+        action = f"{let} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
+        calibrate = ""
         possible_cause, action = _gnss_heading_fault(analysis)
-    elif analysis.source.orientation is not None:
-        actor, parameter = "EKF2", " (EKF2_EV_CTRL bit 3)"
-        if not analysis.flight.log.has_ulog:
-            actor, parameter = "the autopilot", ""
-        action += f" Or let {actor} fuse the yaw of the source{parameter}."
+    elif action and not analysis.flight.log.has_ulog:
+        action = f"{let} the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
@@ -175,7 +183,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
         f"{possible_cause}.",
-        action.strip() or "Check the heading source of EKF2.",
+        f"{calibrate} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,

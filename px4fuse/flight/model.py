@@ -38,6 +38,16 @@ Spans = tuple[Span, ...]
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+# Reason why a source that measures only the height has no positions
+HEIGHT_ONLY = "x and y are NaN in all messages, so the source measures only the height"
+# Ratio of the median absolute second difference to the σ of white noise
+SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
+# Minimum number of positions to estimate their noise
+MIN_NOISE_SAMPLES = 10
+# Minimum noise (1 σ, m) of UWB positions
+MIN_UWB_NOISE_M = 0.03
+# Maximum rate (Hz) of UWB positions
+MAX_UWB_RATE_HZ = 25.0
 # Minimum time (s) on the ground between two flights: the land detector may report short landings
 MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
@@ -47,6 +57,7 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
     "vio": "VIO",
     "mocap": "MOCAP",
     "gnss": "GNSS",
+    "unknown": "external vision",
     "file": "position file",
 }
 
@@ -197,6 +208,27 @@ class PositionTrack:
         return sample_rate(self.samples)
 
 
+def white_noise_m(position_m: Array) -> float:
+    """Estimate the white noise (1 σ, m) of positions from second differences, shape (n, axes).
+
+    Second differences are zero at constant velocity. The result is that of the noisiest axis.
+    """
+    second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
+    return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_FACTOR
+
+
+def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
+    """Return "uwb" for noisy positions at a low rate; else the sensor is "unknown".
+
+    Motion capture, odometry and other precise systems may also send positions only.
+    """
+    position_m = samples[Columns.POSITION[:2]].dropna().drop_duplicates().to_numpy()
+    if len(position_m) < MIN_NOISE_SAMPLES:
+        return "unknown"
+    is_uwb = white_noise_m(position_m) > MIN_UWB_NOISE_M and sample_rate(samples) < MAX_UWB_RATE_HZ
+    return "uwb" if is_uwb else "unknown"
+
+
 def source_name(source: PositionTrack) -> str:
     """Return the name of a position source for users, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
@@ -278,9 +310,9 @@ class FusionRecord:
     # Measured magnetic field (body FRD), ``fused_3d`` (1 while EKF2 fuses all components, 0 for
     # heading only) and, since v1.16, EKF2's low-pass filtered innovations (expected minus measured)
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow, low-pass filtered with FLOW_FILTER_WEIGHT (body FRD): each row is
-    # a weighted mean of ``samples`` values at intervals of ``interval_s``; ``noise_m2_s2`` is R of
-    # each value
+    # Velocity from optical flow (body FRD). Each row is the mean of ``samples`` measurements at
+    # intervals of ``interval_s``, weighted as in EKF2's low-pass filter (FLOW_FILTER_WEIGHT);
+    # ``noise_m2_s2`` is the variance R of one measurement
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin
     latitude_deg: float = np.nan
@@ -326,7 +358,7 @@ class AidLog:
     # Number of innovations that were dropped because no variance is near in time
     excluded_count: int = 0
     # Times of innovations for which the log does not show whether EKF2 fused them
-    unjudged_s: Array = field(default_factory=lambda: np.zeros(0))
+    unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 

@@ -24,7 +24,7 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum value (s) that options state as UNIX time; smaller times count from the first pose
+# Minimum time (s) in an option that is UNIX time; a smaller time counts from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
@@ -106,9 +106,7 @@ def analyse(
     heading_deg = loop_segment.heading_change_deg(path)
     misclosure_m = true_end if isinstance(true_end, Unavailable) else end_m - true_end.displacement
     heading_error_deg = _compute_heading_error(true_end, heading_deg)
-    landing_closure = (
-        gated_closures[0] if gated_closures and gated_closures[0].source == LANDING_SOURCE else None
-    )
+    landing_closure = next((c for c in gated_closures if c.source == LANDING_SOURCE), None)
     distance_corrections = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
@@ -274,8 +272,7 @@ def analyse_flight_loop(
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
-    time = trajectory.time_s
-    inside_m = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
+    inside_m = trajectory.between(segment.start_s, segment.end_s).position_m
     extent_m = gap_m = 0.0
     if len(inside_m):
         extent_m = float(np.linalg.norm(np.ptp(inside_m, axis=0)))

@@ -13,7 +13,7 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# Order and signs of x, y and z in a frame with z down, name of this frame, and note for the user
+# Order and signs of the axes that convert each frame to one with z down, its name, and a note
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],
@@ -106,28 +106,10 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 def distribute_by_distance(
     position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
 ) -> Array:
-    """Correct a path in proportion to the distance: compass rule (Bowditch).
+    """Correct a path in proportion to the distance (compass rule, Bowditch 1808).
 
-    p_k' = p_k - (s_k / s_n) · e
-
-    A pose graph gives the same result if the variance of each translation is proportional to its
-    length and the orientation is perfect.
-
-    Parameters
-    ----------
-    position_m : ndarray, shape (n, d)
-    misclosure_m : ndarray, shape (d,)
-        Closure error e: measured end minus true end.
-    cumulative_m : ndarray, shape (n,), optional
-        Distance s along the path; by default along ``position_m``.
-
-    Returns
-    -------
-    ndarray, shape (n, d)
-
-    Notes
-    -----
-    Bowditch (1808); UAT 366 module 2, Example 2.
+    The closure error (measured minus true end), multiplied by the distance up to a position over
+    the path length, is subtracted from the position. See UAT 366 module 2, Example 2.
     """
     distance_m = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
     return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
@@ -145,23 +127,10 @@ def heading_change_rad(rotation: Rotation) -> float:
 def correct_by_distance(
     trajectory: Trajectory, cumulative_m: Array, misclosure_m: Array, misclosure_heading_rad: float
 ) -> Trajectory:
-    """Distribute the closure errors of position and heading by distance.
+    """Distribute the closure errors (measured minus true) of position and heading by distance.
 
-    Each orientation is corrected by a fraction of the heading error (slerp about the vertical): the
-    distance up to the pose over the path length. The displacements between poses are rotated by the
-    same angle, which keeps the shape of the path. The remaining position error is distributed by
-    the compass rule.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Trajectory in a frame with z down.
-    cumulative_m : ndarray, shape (n,)
-        Distance along the path at each pose.
-    misclosure_m : ndarray, shape (3,)
-        Closure error: measured end minus true end.
-    misclosure_heading_rad : float
-        Heading error: measured minus true final heading; 0 if unknown.
+    Orientations, and displacements between poses, are rotated about the vertical in proportion to
+    the distance. The remaining position error is distributed by the compass rule.
     """
     position_m = trajectory.position_m
     fraction = cumulative_m / cumulative_m[-1]

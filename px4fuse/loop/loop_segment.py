@@ -35,20 +35,19 @@ def cut_trajectory(
         The segment contains fewer than three poses.
     """
     time = trajectory.time_s
-    is_inside = (time >= segment.start_s) & (time <= segment.end_s)
-    if is_inside.sum() < MIN_POSES:
+    segment_track = trajectory.between(segment.start_s, segment.end_s)
+    if len(segment_track) < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {is_inside.sum()} poses "
-            f"between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
+            f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {len(segment_track)} "
+            f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
             f"{MIN_POSES} are needed"
         )
-    segment_track = trajectory[is_inside]
     if not rests_at_ends:
         return segment_track
     position = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
-        poses_at_rest = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
+        poses_at_rest = trajectory.between(rest_start_s, rest_start_s + REST_TIME_S)
         # If the vehicle is not at rest, the single pose at this end of the segment is used
         if (
             not len(poses_at_rest)

@@ -68,60 +68,39 @@ class TrueEnd(Record, frozen=True, kw_only=True):
 class OdometryNoise(Record, frozen=True, omit_defaults=False):
     """Drift of odometry: random walks over distance and over time.
 
-    Attributes
-    ----------
-    position_m : float
-        Standard deviation of the position per axis after 100 m, without the effect of heading
-        errors.
-    heading_deg : float
-        Standard deviation of the heading after 100 m.
-    position_m_per_root_s, heading_deg_per_root_s : float
-        Random walk over time (m/√s, °/√s), also while hovering.
-    tilt_share : float
-        Ratio of the drift of roll and pitch to the drift of heading; small, because gravity is
-        measured.
-
-    Notes
-    -----
     The defaults are for indoor visual-inertial odometry: about 1 % of the distance (Delmerico and
-    Scaramuzza 2018; Intel's data sheet of the T265 states the same).
+    Scaramuzza 2018; Intel's data sheet of the T265).
     """
 
+    # σ of the position per axis after 100 m, without the effect of heading errors
     position_m: NotNegative = 1.0
+    # σ of the heading after 100 m
     heading_deg: NotNegative = 3.0
+    # Random walk over time (m/√s, °/√s), also while hovering
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
+    # Ratio of the drift of roll and pitch to that of heading; small, because of gravity
     tilt_share: NotNegative = 0.1
 
 
 class Closure(Record, frozen=True, kw_only=True):
-    """Loop closure (two times at the same place), with gate result and robust weight.
+    """Loop closure (two times at the same place), with gate result and robust weight."""
 
-    Attributes
-    ----------
-    time_1_s, time_2_s : float
-        Times on the clock of the trajectory.
-    sigma_m : float
-        Standard deviation of the displacement between the two times, per axis.
-    source : str
-        "landing" for the closure of take-off and landing, "given" for ``--closure``.
-    distance_m : float
-        Closure error of the odometry: odometry minus true displacement.
-    d2, degrees_of_freedom, p, accepted
-        See :class:`~px4fuse.trajectory.graph.covariance.GateResult`.
-    weight_gnc : float or None
-        Weight of robust optimisation, 0 to 1; None with a single closure (no redundancy).
-    """
-
+    # Times on the clock of the trajectory
     time_1_s: float
     time_2_s: float
+    # σ of the displacement between the two times, per axis
     sigma_m: NotNegative
+    # "landing" for the closure of take-off and landing, "given" for ``--closure``
     source: str
+    # Closure error: displacement from odometry minus true displacement
     distance_m: NotNegative
+    # Gate: squared Mahalanobis distance, degrees of freedom, p-value and decision
     d2: NotNegative
     degrees_of_freedom: Count
     p: Share
     accepted: bool
+    # Weight of robust optimisation, 0 to 1; None with a single closure (no redundancy)
     weight_gnc: float | None = None
 
     def __str__(self) -> str:

@@ -39,22 +39,22 @@ def odometry_variances(
 
     Returns
     -------
-    translation : ndarray, shape (k - 1,)
-        Variance (m²) per axis.
-    rotation : ndarray, shape (k - 1, 3)
-        Variances (rad²) about the body axes.
+    translation_m2 : ndarray, shape (k - 1,)
+        Variance per axis.
+    rotation_rad2 : ndarray, shape (k - 1, 3)
+        Variances about the body axes.
     statement : str
         Sentence on the origin of the variances.
     """
     length_m = np.diff(cumulative_distance(path.position_m[nodes]))
     duration_s = np.diff(path.time_s[nodes])
-    translation = (
+    translation_m2 = (
         noise.position_m**2 / 100.0 * length_m + noise.position_m_per_root_s**2 * duration_s
     )
-    heading = np.radians(noise.heading_deg) ** 2 / 100.0 * length_m
-    heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration_s
-    tilt = noise.tilt_share**2 * heading
-    rotation = np.column_stack([tilt, tilt, heading])
+    heading_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * length_m
+    heading_rad2 = heading_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * duration_s
+    tilt_rad2 = noise.tilt_share**2 * heading_rad2
+    rotation_rad2 = np.column_stack([tilt_rad2, tilt_rad2, heading_rad2])
     drift_origin = "default" if noise == OdometryNoise() else "from options"
     origin_texts = [
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
@@ -62,7 +62,9 @@ def odometry_variances(
     ]
     position_growth = _variance_growth(path.position_variance_m2, nodes)
     if position_growth is not None:
-        translation = np.maximum(position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation)
+        translation_m2 = np.maximum(
+            position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_m2
+        )
         origin_texts.append(
             "the translation variances of the odometry are computed from the increase of the "
             "logged position variances"
@@ -71,12 +73,12 @@ def odometry_variances(
         origin_texts.append("the logged position variances do not grow, so they are not used")
     rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
     if rotation_growth is not None:
-        rotation = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation)
+        rotation_rad2 = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation_rad2)
         origin_texts.append(
             "the rotation variances of the odometry are computed from the increase of the logged "
             "orientation variances"
         )
-    return translation, rotation, "; ".join(origin_texts)
+    return translation_m2, rotation_rad2, "; ".join(origin_texts)
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:

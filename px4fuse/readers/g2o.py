@@ -40,19 +40,15 @@ _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
-    """Read a pose graph.
+    """Read a pose graph; without vertices in the file, the edges initialise the poses.
 
-    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are read. Blank lines, comments
-    (``#``), repeated blanks and Windows line ends are accepted. Vertices are sorted by id. One FIX
-    is accepted and ignored: px4fuse always fixes the first pose, which only changes the frame. In
-    a file without vertices the edges initialise the poses.
+    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT and EDGE_SE3:QUAT are read. FIX is ignored, because
+    px4fuse always fixes the first pose.
 
     Raises
     ------
     TrajectoryError
-        The file is not a g2o file, or it contains a number that is not finite, an edge to a missing
-        vertex, a repeated vertex, an invalid information matrix, or both SE2 and SE3 poses. The
-        error message contains the file name and the line number.
+        The file is not a g2o file, or a line is invalid.
     """
     path = Path(path)
     name = display_name(path)

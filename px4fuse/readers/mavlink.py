@@ -50,21 +50,10 @@ REAL32_PARAMETER_TYPE = 9
 # No warnings for damaged values: they become NaN or infinite, and such samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
-    """Read a MAVLink recording.
+    """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
 
-    Parameters
-    ----------
-    name : str
-        File name.
-    content : bytes
-        ``.tlog`` of QGroundControl or MAVProxy, or a raw stream of MAVLink 1 and 2.
-    system : int, optional
-        MAVLink system id of the vehicle; by default the autopilot with the most messages.
-
-    Returns
-    -------
-    Flight
-        Missing data are ``Unavailable``.
+    ``system`` is the MAVLink system id of the vehicle, by default of the autopilot with the most
+    messages.
 
     Raises
     ------
@@ -125,8 +114,9 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     if len(rows) < 2:
         reason = "the recording contains no HIGHRES_IMU or SCALED_IMU"
         if raw_count := len(recording.rows("RAW_IMU")):
-            raw_note = f"{raw_count} RAW_IMU messages are not used, because raw counts have no unit"
-            reason = f"{reason}; {raw_note}"
+            reason += (
+                f"; {raw_count} RAW_IMU messages are not used, because raw counts have no unit"
+            )
         return Unavailable("IMU", reason, remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):

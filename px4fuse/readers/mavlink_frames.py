@@ -44,7 +44,7 @@ MIN_VALID_FRACTION = 0.01
 # receive time with a larger difference is damaged
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
-    message.msgname: at for at, message in dialect.mavlink_map.items()
+    message.msgname: number for number, message in dialect.mavlink_map.items()
 }
 # Vehicle type by number of the MAV_TYPE: "quadrotor" for MAV_TYPE_QUADROTOR
 VEHICLE_TYPES = {
@@ -62,35 +62,12 @@ _BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], d
 
 @dataclass(frozen=True)
 class Frames:
-    """MAVLink frames of one recording with valid checksums, in file order.
-
-    Attributes
-    ----------
-    name : str
-        File name.
-    content : bytes
-    sha256 : str
-    start : ndarray of int64, shape (n,)
-        Offset of each frame's first byte.
-    message_id : ndarray of int32, shape (n,)
-    system, component, sequence : ndarray of uint8, shape (n,)
-    payload_start : ndarray of int64, shape (n,)
-    payload_length : ndarray of uint8, shape (n,)
-    received_us : ndarray of int64, shape (n,), or None
-        Receive times (UNIX, µs); damaged values are interpolated. None for a raw stream.
-    unknown_frame_count : int
-        Number of complete frames with messages that are not in the dialect.
-    bad_bytes : int
-        Number of bytes that are not part of a frame.
-    ends_in_frame : bool
-        True if the file ends within a frame.
-    damaged_receive_times : int
-        Number of damaged receive times.
-    """
+    """MAVLink frames of one recording with valid checksums, in file order."""
 
     name: str
     content: bytes
     sha256: str
+    # Offset of each frame's first byte in the content
     start: Integers
     message_id: NDArray[np.int32]
     system: NDArray[np.uint8]
@@ -98,10 +75,15 @@ class Frames:
     sequence: NDArray[np.uint8]
     payload_start: Integers
     payload_length: NDArray[np.uint8]
+    # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
     received_us: Integers | None
+    # Number of complete frames with messages that are not in the dialect
     unknown_frame_count: int
+    # Number of bytes that are not part of a frame
     bad_bytes: int
+    # True if the file ends within a frame
     ends_in_frame: bool
+    # Number of damaged receive times
     damaged_receive_times: int
 
     def __len__(self) -> int:
@@ -117,20 +99,9 @@ class Frames:
         return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
-        """Decode frames of one message.
+        """Decode frames of one message to a structured array of its fields, in MAVLink units.
 
-        Parameters
-        ----------
-        message : str
-            MAVLink name, for example "ATTITUDE".
-        rows : ndarray, shape (n,)
-            Frame indices from :meth:`rows`.
-
-        Returns
-        -------
-        structured ndarray, shape (n,)
-            One field per MAVLink field, in MAVLink units. MAVLink 2 omits trailing zeros from the
-            payload; they are restored.
+        Trailing zeros of the payload, which MAVLink 2 omits, are restored.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
@@ -172,14 +143,7 @@ def wire_layout(message_id: int) -> np.dtype[Any]:
 
 
 def read_frames(name: str, content: bytes) -> Frames:
-    """Find all frames with valid checksums in a recording.
-
-    Parameters
-    ----------
-    name : str
-        File name for error messages.
-    content : bytes
-        A ``.tlog`` with receive times, or a raw stream of MAVLink 1 and 2.
+    """Find all frames with valid checksums in a ``.tlog`` or a raw stream.
 
     Raises
     ------
@@ -243,8 +207,8 @@ def _find_valid_frames(content: bytes) -> Integers:
 def _remove_nested_frames(frames: Integers) -> Integers:
     """Remove frames that begin inside the previous frame.
 
-    The payload of a frame may contain another frame (message TUNNEL). A receive time may look like
-    the header of a frame. Such a false frame must not remove the frame after the receive time.
+    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. Such
+    a false frame must not remove the frame after the receive time.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -266,11 +230,7 @@ def _remove_nested_frames(frames: Integers) -> Integers:
 def _find_possible_frames(
     content_bytes: NDArray[np.uint8], block_start: int
 ) -> tuple[Integers, Integers]:
-    """Find the bytes of a block at which frames may begin.
-
-    Return start, end and message id of the possible frames, shape (n, 3), and the offsets of their
-    checksums.
-    """
+    """Return start, end and message id of possible frames in a block, and checksum offsets."""
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start = block_start + np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2))
     header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
@@ -309,19 +269,10 @@ def _has_receive_times(start: Integers, end: Integers) -> bool:
 def _count_other_bytes(
     content: bytes, start: Integers, end: Integers, time_bytes: int
 ) -> tuple[int, int, bool]:
-    """Count frames and bytes between the valid frames.
+    """Count unknown frames and other bytes between the valid frames.
 
-    ``start`` is the offset of each frame including its receive time of ``time_bytes`` bytes (0 in a
-    raw stream).
-
-    Returns
-    -------
-    int
-        Number of complete frames with messages that are not in the dialect.
-    int
-        Number of bytes that are not part of a frame.
-    bool
-        True if the file ends within a frame.
+    Return also True if the file ends within a frame. Each ``start`` includes the ``time_bytes`` of
+    a receive time.
     """
     unknown_frame_count = 0
     bad_bytes = 0
@@ -362,12 +313,12 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 
 
 def _read_receive_times(
-    source: NDArray[np.uint8], start: Integers, end: Integers
+    content_bytes: NDArray[np.uint8], start: Integers, end: Integers
 ) -> tuple[Integers, int]:
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES
-    windows = np.lib.stride_tricks.sliding_window_view(source, RECEIVE_TIME_BYTES)
+    windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
     raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
         :, 0

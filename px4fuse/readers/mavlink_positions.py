@@ -58,8 +58,8 @@ def read_positions(
                 message, f"the recording contains no {message} sent to the autopilot", remedy
             )
         ]
-    fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
-    tracks_and_missing += [track for track in fixes if track]
+    gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
+    tracks_and_missing += [track for track in gnss_tracks if track]
     return px4_positions.split_tracks(tracks_and_missing)
 
 
@@ -120,6 +120,8 @@ def _read_gnss(
     The autopilot repeats each fix until the next one. Return None without messages.
     """
     rows = recording.rows(layout.topic)
+    if not len(rows):
+        return None
     count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
@@ -130,14 +132,10 @@ def _read_gnss(
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         fix_count = "none" if fixes.empty else f"only {len(fixes)}"
-        return (
-            px4_positions.unavailable(
-                layout.topic,
-                f"{count} messages, {fix_count} with a 3D fix",
-                "Give the antenna a free view of the sky and wait for a fix.",
-            )
-            if count
-            else None
+        return px4_positions.unavailable(
+            layout.topic,
+            f"{count} messages, {fix_count} with a 3D fix",
+            "Give the antenna a free view of the sky and wait for a fix.",
         )
     samples = project_to_ned(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2

@@ -76,7 +76,7 @@ class Recording:
     def rows(self, message: str, address: Address | None = None) -> IntArray:
         """Return the frame indices of one message from one sender (default: autopilot)."""
         rows = self.rows_of_all_senders(message)
-        return np.asarray(rows[self.frames.sent_by(address or self.address, rows)])
+        return rows[self.frames.sent_by(address or self.address, rows)]
 
     def read(
         self,
@@ -163,9 +163,7 @@ class Recording:
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
-    """Convert ODOMETRY samples to NED (or FRD).
-
-    Values in unsupported frames become NaN.
+    """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
 
     The velocity is in the child frame of the message: the body frame in PX4 up to v1.13, NED later
     (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because

@@ -182,14 +182,19 @@ def clock_maps(
         note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = (
-                "this map is estimated from the messages with the least delay, and only orders "
-                "messages and maps other clocks"
+                "this conversion is estimated from the messages with the least delay; it is only "
+                "used to order messages and to convert other clocks"
             )
-        offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
-        name = "receive time (UNIX time of the recording computer)"
-        drift_ppm = (line.slope - 1.0) * 1e6
         clocks.append(
-            ClockMap(name, "receive time", line.pairs, offset_s, drift_ppm, line.jitter, note)
+            ClockMap(
+                clock="receive time (UNIX time of the recording computer)",
+                method="receive time",
+                pairs=line.pairs,
+                offset_s=line.y0 - line.x0 - float(received_us[0]) * 1e-6,
+                drift_ppm=(line.slope - 1.0) * 1e6,
+                jitter_s=line.jitter,
+                note=note,
+            )
         )
     return tuple(clocks)
 

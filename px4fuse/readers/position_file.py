@@ -134,8 +134,7 @@ def read_position_file(
     Raises
     ------
     LogError
-        The file cannot be read, is not a text table, has no columns of time and position, has more
-        columns than header names, or has fewer than three usable rows.
+        The file cannot be read, or contains no table of times and positions.
     SettingsError
         An option has an invalid value or names a column that is not in the file.
     """
@@ -380,9 +379,9 @@ def _choose_columns(
             meaning if index in position else ColumnMeaning()
             for index, meaning in enumerate(meanings)
         ]
-        named = position_names.find_position(chosen_meanings)
-        if named and {*named[1]} == {*position}:
-            frame, position = named
+        named_position = position_names.find_position(chosen_meanings)
+        if named_position and {*named_position[1]} == {*position}:
+            frame, position = named_position
     else:
         time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
@@ -400,7 +399,7 @@ def _choose_columns(
             are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_SHARE
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time] += numbers[index] * 1e-9
-                other_times = [other for other in other_times if other != index]
+                other_times = [column for column in other_times if column != index]
                 time_text += f" plus {table.label(index)}"
         if other_times:
             time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"

@@ -73,8 +73,8 @@ def read_column_name(name: str) -> ColumnMeaning:
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
     if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
-        kinds = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
-        return ColumnMeaning("time", TIME_KINDS[kinds.index(True)], unit)
+        is_kind = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
+        return ColumnMeaning("time", TIME_KINDS[is_kind.index(True)], unit)
     if word_set and word_set <= _ROLES["tag"]:
         return ColumnMeaning("tag")
     position_words = _ROLES["sigma"] | _ROLES["context"]

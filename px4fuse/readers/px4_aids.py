@@ -122,7 +122,7 @@ def _read_common_topics(
     for values, variances in layouts:
         innovations = topics.primary_samples(values)
         samples = topics.primary_samples(values, select=_drop_repeats)
-        unjudged_s = _unjudged_times(
+        unknown_fusion_s = _unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variances)[f"variance_{aid.axes[0]}"],
         )
@@ -136,7 +136,7 @@ def _read_common_topics(
         used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
         log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
         if log is not None:
-            return replace(log, unjudged_s=unjudged_s)
+            return replace(log, unknown_fusion_s=unknown_fusion_s)
     return None
 
 
@@ -147,7 +147,7 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
-def _unjudged_times(innovation: pd.Series, variance: pd.Series) -> Array:
+def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
     # An innovation of 0 means that EKF2 had no sample. A variance that changes shows fusion, even
     # if the logged innovation is old
     is_changed = (variance > 0.0) & variance.ne(variance.shift())

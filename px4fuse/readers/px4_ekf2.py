@@ -91,7 +91,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled_aids = read_enabled_aids(topics)
-    fusion_flags = _read_fusing(topics, enabled_aids)
+    fusion_flags = _read_fusion_flags(topics, enabled_aids)
     gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled_aids)
     innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, gate)
@@ -219,9 +219,8 @@ def samples_per_step(
 ) -> int:
     """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 divides ``configured_step_s`` by a mean of the measured intervals and rounds, so a ratio
-    near n + 0.5 may be rounded up or down. This function rounds up, unless only the smaller number
-    is consistent with ``step_ends``, the logged ends of predictions (index of the IMU sample).
+    EKF2 may round a ratio near n + 0.5 up or down. It is rounded up here, unless only the smaller
+    number agrees with ``step_ends``, the indices of IMU samples at which logged predictions end.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
@@ -231,10 +230,14 @@ def samples_per_step(
     ratio_plus_half = configured_step_s / imu_interval_s + 0.5
     # The added 1e-6 makes the result independent of the rounding of timestamps to µs
     samples = max(int(ratio_plus_half + 1e-6), 1)
-    gaps = np.diff(np.asarray(step_ends, dtype=float))
-    if samples > 1 and abs(ratio_plus_half - samples) < MAX_HALF_DISTANCE and len(gaps):
+    sample_differences = np.diff(np.asarray(step_ends, dtype=float))
+    if (
+        samples > 1
+        and abs(ratio_plus_half - samples) < MAX_HALF_DISTANCE
+        and len(sample_differences)
+    ):
         fits_larger, fits_smaller = (
-            np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1)
+            np.mean(sample_differences % count == 0.0) > 0.9 for count in (samples, samples - 1)
         )
         return samples - int(fits_smaller and not fits_larger)
     return samples
@@ -271,7 +274,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     return pd.Series(dtype=np.float64)
 
 
-def _read_fusing(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
+def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled_aids.keys():
@@ -370,11 +373,11 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
     shift_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     candidates[1] = candidates[1].set_axis(candidates[1].index + shift_s)
-    complete = [
+    complete_fields = [
         field for field in candidates if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
     ]
-    with_innovation = [field for field in candidates if Columns.FIELD_INNOVATION[0] in field]
-    field = max(complete or with_innovation or candidates, key=len)
+    fields_with_innovation = [field for field in candidates if Columns.FIELD_INNOVATION[0] in field]
+    field = max(complete_fields or fields_with_innovation or candidates, key=len)
     bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
     if field.empty or bits.empty:
         return pd.DataFrame()
@@ -383,7 +386,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Undo EKF2's low-pass filter of optical flow; return the mean velocity of each interval."""
+    """Undo EKF2's low-pass filter of optical flow; return weighted means between two rows."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
@@ -404,8 +407,13 @@ def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
         (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)
     ).T
     velocity = velocity.iloc[rows]
-    newest, rates = ["newest_forward_m_s", "newest_right_m_s"], ["x_rad_s", "y_rad_s"]
-    squared_range = (velocity[newest] ** 2).sum(axis=1) / (velocity[rates] ** 2).sum(axis=1)
+    newest_columns, rate_columns = (
+        ["newest_forward_m_s", "newest_right_m_s"],
+        ["x_rad_s", "y_rad_s"],
+    )
+    squared_range = (velocity[newest_columns] ** 2).sum(axis=1) / (velocity[rate_columns] ** 2).sum(
+        axis=1
+    )
     flow = pd.DataFrame(
         {
             "forward_m_s": forward,

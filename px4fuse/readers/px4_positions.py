@@ -13,12 +13,14 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import (
+    HEIGHT_ONLY,
     NO_INVALID_ROWS,
     Columns,
     Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
+    kind_without_orientation,
     sample_rate,
     time_index,
 )
@@ -70,12 +72,12 @@ def read_positions(
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
-    turns = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
+    is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
             *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
-            _read_ev_pos_aid(topics, turns),
-            _reconstruct(topics, ekf2, turns),
+            _read_ev_pos_aid(topics, is_odometry),
+            _reconstruct(topics, ekf2, is_odometry),
             _read_gps(topics, ekf2),
         ]
     )
@@ -119,6 +121,8 @@ def make_track(
     """
     status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
+    is_nan = samples[Columns.POSITION].isna().to_numpy()
+    is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
     step_m = max(rounding_step(samples[name].to_numpy()) for name in needed_columns[:2])
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
@@ -126,11 +130,12 @@ def make_track(
         reason = find_invalid(samples, needed_columns)
         samples, invalid = samples[reason == ""], reason[reason != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
-        return unavailable(
-            name,
-            f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}",
-            remedy,
-        )
+        fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
+        if is_height_only:
+            fault = HEIGHT_ONLY
+        return unavailable(name, fault, remedy)
+    if origin.kind == "uwb":
+        origin = structs.replace(origin, kind=kind_without_orientation(samples))
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -149,12 +154,12 @@ def _make_ulog_track(
     samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
-    turns: bool = False,
+    is_odometry: bool = False,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a ULog track; ``turns`` is True if the source sends a changing orientation."""
+    """Make a ULog track; ``is_odometry`` is True if its source sends a changing orientation."""
     source = px4.TRACKS[name]
-    origin = with_orientation(source.origin, is_changing=turns)
+    origin = with_orientation(source.origin, is_changing=is_odometry)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
@@ -172,21 +177,28 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
     frame = "unknown"
-    for field, names in px4.FRAMES.items():
+    for field, frame_names in px4.FRAMES.items():
         if field in samples and len(samples):
-            frame = names.get(int(samples[field].iloc[-1]), "unknown")
+            frame = frame_names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # EKF2 rotated the positions, but the field still contains the old frame
     if "published_us" in samples:
         published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
         samples["age_s"] = published_s - samples.index
     orientation = read_orientation(samples)
+    notes: tuple[str, ...] = ()
+    if not is_ekf2 and (count := len(topics.instances(layout.topic))) > 1:
+        notes = (
+            f"{layout.topic} has {count} instances: {count} programs publish it. px4fuse and EKF2 "
+            "use instance 0.",
+        )
     return _make_ulog_track(
         topics,
         name,
         samples,
         (layout.topic,),
-        turns=orientation is not None,
+        notes=notes,
+        is_odometry=orientation is not None,
         frame=frame,
         clock_map=_arrival_clock_map(topics, layout.topic),
         orientation=orientation,
@@ -225,7 +237,9 @@ def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     if not sampled_us.any():
         return "0"
     rate = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
-    units = [name for name, us in STAMP_UNITS.items() if abs(rate / us - 1.0) < MAX_RATE_ERROR]
+    units = [
+        name for name, unit_us in STAMP_UNITS.items() if abs(rate / unit_us - 1.0) < MAX_RATE_ERROR
+    ]
     if not units:
         return "an unknown clock"
     stamp_s = float(np.median(sampled_us)) * STAMP_UNITS[units[0]] * 1e-6
@@ -234,17 +248,17 @@ def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     return units[0] if units[0] != "microseconds" else "another clock"
 
 
-def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
+def _read_ev_pos_aid(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
         return unavailable(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
     samples = topics.primary_samples(layout)
     used_topics = [layout.topic]
     notes: tuple[str, ...] = ()
-    vertical = topics.find(px4.LAYOUTS["kept_vertical"])
-    if vertical is not None:
-        samples, notes = _with_height(samples, topics.primary_samples(vertical))
-        used_topics.append(vertical.topic)
+    vertical_layout = topics.find(px4.LAYOUTS["kept_vertical"])
+    if vertical_layout is not None:
+        samples, notes = _with_height(samples, topics.primary_samples(vertical_layout))
+        used_topics.append(vertical_layout.topic)
     # EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
     samples = _shift_times(samples, _delay_s(topics) + 0.5 * configured_step_s(topics))
@@ -253,7 +267,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
         px4.FUSED_OBSERVATION,
         samples,
         tuple(used_topics),
-        turns=turns,
+        is_odometry=is_odometry,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
     )
@@ -286,7 +300,7 @@ def _delay_s(topics: Topics) -> float:
 
 
 def _reconstruct(
-    topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool
+    topics: Topics, ekf2: Ekf2 | Unavailable, is_odometry: bool
 ) -> PositionTrack | Unavailable:
     """Reconstruct the source's positions as EKF2 position plus innovation.
 
@@ -312,7 +326,7 @@ def _reconstruct(
         px4.RECONSTRUCTION,
         _shift_times(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
-        turns=turns,
+        is_odometry=is_odometry,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
         clock=f"time of the innovation plus {EV_POS.delay}, up to one sample interval late",
@@ -370,9 +384,13 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    If ``origin`` is None, the first sample is the origin.
+    If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
+    latitude and longitude 0: these samples become NaN.
     """
-    latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
+    global_positions = global_positions[GLOBAL_COLUMNS].mask(
+        (global_positions[GLOBAL_COLUMNS[:2]] == 0.0).all(axis=1)
+    )
+    latitude, longitude, altitude = global_positions.to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
     ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
@@ -474,24 +492,24 @@ def read_truth(
     differs from the origin of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
-    local, in_degrees = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
-    logged_local = topics.read(local)
+    local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
+    logged_local = topics.read(local_layout)
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(in_degrees), GLOBAL_COLUMNS[:2])
+    global_positions = finite_rows(topics.read(global_layout), GLOBAL_COLUMNS[:2])
     if len(global_positions):
         projected = project_to_ned(global_positions, _local_origin(topics))
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
-            return Truth(in_degrees.topic, projected.join(velocity), attitude)
+            return Truth(global_layout.topic, projected.join(velocity), attitude)
         if fused_aid(ekf2):
             local_samples = _move_to_origin(local_samples, projected)
     if len(local_samples):
-        return Truth(local.topic, local_samples, attitude)
+        return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
-            f"{local.topic} has no finite sample",
+            f"{local_layout.topic} has no finite sample",
             "Check the simulation that writes the ground truth.",
         )
     return mocap_truth or Unavailable(

@@ -146,7 +146,7 @@ def find_table(
     if _is_complete(last_line, whole_lines.rpartition("\n")[2]):
         text += f"{last_line}\n"
     elif last_line.strip():
-        notes.append("the last line of the position file was dropped, because it has no line end")
+        notes.append("the last line of the position file was dropped, because it is incomplete")
     table = None if columns else _find_json(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
@@ -178,7 +178,9 @@ def find_table(
 def _is_complete(line: str, line_before: str) -> bool:
     """Return True if the last line has as many columns and decimals as the line before."""
     cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
-    decimals, decimals_before = (one[-1].partition(".")[2] for one in (cells, cells_before))
+    decimals, decimals_before = (
+        row_cells[-1].partition(".")[2] for row_cells in (cells, cells_before)
+    )
     return "." in line and len(cells) == len(cells_before) and len(decimals) >= len(decimals_before)
 
 
@@ -289,13 +291,18 @@ def _find_json(file_name: str, text: str) -> Table | None:
         record for value in values for record in (value if isinstance(value, list) else [value])
     ]
     columns = pd.json_normalize(records)
-    paths = [path for path in map(str, columns) if read_column_name(path).kind]
-    is_pozyx = "data.coordinates.x" in paths
+    column_paths = [
+        column_path for column_path in map(str, columns) if read_column_name(column_path).kind
+    ]
+    is_pozyx = "data.coordinates.x" in column_paths
     return Table(
         file_name,
         "Pozyx JSON stream" if is_pozyx else "JSON lines",
-        [path + "_mm" * (is_pozyx and ".coordinates." in path) for path in paths],
-        columns[paths].to_csv(index=False, header=False),
+        [
+            column_path + "_mm" * (is_pozyx and ".coordinates." in column_path)
+            for column_path in column_paths
+        ],
+        columns[column_paths].to_csv(index=False, header=False),
     )
 
 

@@ -62,28 +62,13 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
-    """Read the poses of one topic of a bag.
-
-    Parameters
-    ----------
-    path : Path
-        File, or folder of a ROS 2 bag.
-    topic : str or None
-        Topic to read; None for the only topic with positions.
-
-    Returns
-    -------
-    table : Table
-        Times of the message headers, positions, orientations and sigmas.
-    sha256 : str
-        SHA-256 of the files of the bag.
-    size_bytes : int
+    """Read the poses of one topic of a bag; return also its SHA-256 and size (bytes).
 
     Raises
     ------
     LogError
         The library rosbags is not installed, the bag cannot be read or is too large, or the topic
-        is not one with positions.
+        contains no positions.
     """
     name = display_name(path)
     try:

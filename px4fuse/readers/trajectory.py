@@ -53,29 +53,14 @@ _FRAMES: dict[tuple[str, ...], Frame] = {("ned",): "NED", ("enu",): "ENU", ("edn
 
 
 def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
-    """Read a trajectory file.
+    """Read a trajectory file, and detect its kind and frame.
 
-    Parameters
-    ----------
-    path : str or Path
-        File in the format of TUM, EuRoC ground truth or ORB-SLAM3, or a recording that
-        :func:`px4fuse.readers.position_file.read_position_file` reads.
-    body : str, optional
-        Body or tag in the file, or topic of a ROS bag.
-
-    Returns
-    -------
-    Trajectory
-        ``time_s`` are the timestamps of the file in s. ``kind`` is "truth" if a comment, the file
-        name or the EuRoC columns indicate ground truth, and "slam" if the first pose is the
-        identity. ``frame`` is "camera" if ``kind`` is "slam" and the motion is level with y
-        vertical.
+    ``body`` is a body or tag in the file, or a topic of a ROS bag.
 
     Raises
     ------
     TrajectoryError
-        The file cannot be read or contains no positions with height, fewer than three poses, more
-        than 1 % invalid rows, or quaternions without unit length.
+        The file cannot be read, or its poses are not valid.
     """
     path = Path(path)
     try:
@@ -198,10 +183,7 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
 
 
 def _describe_gaps(time: Array, kind: Kind) -> str:
-    """Return a note on gaps between poses or an irregular pose rate.
-
-    Return an empty string if the pose rate is regular.
-    """
+    """Return a note on gaps between poses or an irregular pose rate, else an empty text."""
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s

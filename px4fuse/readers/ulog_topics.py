@@ -92,8 +92,7 @@ class _Content(io.BytesIO):
     byte, or to the next synchronisation message.
     """
 
-    # offsets of the last message header, the end of the last read, and the next read
-
+    # Offsets of the last message header, of the end of the last read, and of the next read
     skipped_bytes = start = end = position = 0
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
@@ -284,7 +283,7 @@ class Topics:
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the instance that was primary at each time.
 
-        The frame is empty if the layout is not in the log.
+        The result is empty if the topic is not in the log.
 
         Parameters
         ----------
@@ -370,12 +369,12 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
         previous_index[index] = last_indices[length - 1] if length else -1
         last_times[length : length + 1] = [time]
         last_indices[length : length + 1] = [index]
-    run = []
+    run_indices = []
     index = last_indices[-1]
     while index >= 0:
-        run.append(index)
+        run_indices.append(index)
         index = int(previous_index[index])
-    return indices[np.array(run[::-1], dtype=np.intp)]
+    return indices[np.array(run_indices[::-1], dtype=np.intp)]
 
 
 def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
@@ -493,14 +492,14 @@ def _read_parameters(
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
         if not isinstance(value, int | float):
             continue
-        before, changed = values.get(name), float(value)
+        before, new_value = values.get(name), float(value)
         if time_us <= take_off_us or before is None:
-            values[name] = changed
+            values[name] = new_value
             continue
-        last = next((change.after for change in changes[::-1] if change.name == name), before)
-        if name.startswith("EKF2_") and last != changed:
+        last_value = next((change.after for change in changes[::-1] if change.name == name), before)
+        if name.startswith("EKF2_") and last_value != new_value:
             time_s = (time_us - zero_us) * _MICROSECOND
-            changes.append(ParameterChange(time_s, name, last, changed))
+            changes.append(ParameterChange(time_s, name, last_value, new_value))
     return values, tuple(changes)
 
 
@@ -510,11 +509,11 @@ def _read_tables(ulog: ULog) -> Tables:
     Two subscriptions to one topic are merged to the fields that both have.
     """
     tables: Tables = {}
-    for data in ulog.data_list:
-        if "timestamp" not in data.data:
+    for subscription in ulog.data_list:
+        if "timestamp" not in subscription.data:
             continue
-        key = (data.name, data.multi_id)
-        table = {name: np.asarray(values) for name, values in data.data.items()}
+        key = (subscription.name, subscription.multi_id)
+        table = {name: np.asarray(values) for name, values in subscription.data.items()}
         if key in tables:
             other_table = tables[key]
             table = {
@@ -540,10 +539,7 @@ def _data_span(tables: Tables, name: str) -> tuple[int, int]:
             breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
             longest_us = max(np.split(increasing_us, breaks), key=len)
             return int(longest_us[0]), int(longest_us[-1])
-    raise LogError(
-        f"{name}: all timestamps are zero",
-        "Record the flight again.",
-    )
+    raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 
 
 def _printable_text(info: dict[str, Any], key: str, default: str) -> str:

@@ -52,15 +52,9 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 
 
 def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
-    """Draw gaps, resets, rejections and outliers, and limit the time axis.
+    """Draw gaps, resets, rejections and outliers on a time axis.
 
-    Parameters
-    ----------
-    axes : Axes
-        x in seconds since the first data.
-    analysis : Analysis
-    axis : str, optional
-        Axis of the rejections to mark, by default the main axis; "" for none.
+    ``axis`` selects the rejections: by default those of the main axis, none for "".
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -96,13 +90,7 @@ def panel(
     axis: str | None = None,
     with_time_label: bool = True,
 ) -> Axes:
-    """Add a plot over time with the events of :func:`draw_marks`.
-
-    Parameters
-    ----------
-    with_time_label : bool
-        False if a plot below this one has the label of the time axis.
-    """
+    """Add a plot over time with the events of :func:`draw_marks`."""
     axes = page.panel(title, caption, height, above=above)
     draw_marks(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)

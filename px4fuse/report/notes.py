@@ -1,13 +1,12 @@
 """Page with the answer form and the notes (Markdown) of the student.
 
-HTML tags are removed, pictures are not loaded, and TeX becomes Unicode text.
+HTML tags are removed, and pictures are not loaded.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from html.entities import html5
 from itertools import accumulate
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 if TYPE_CHECKING:
-    from markdown_it.rules_inline import StateInline
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
@@ -28,28 +26,7 @@ INDENT = 12.0  # indent (points) of each list level
 MAX_INDENTS = 8  # maximum number of indents of a text
 # Maximum depth of nested Markdown: each level needs three of Python's 1000 stack levels
 MAX_NESTING = 100
-# No space follows an opening $. No space precedes and no digit follows a closing $, so prices such
-# as $5 and $10 are not mathematics
-MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
-COMMAND_PATTERN = re.compile(r"\\([A-Za-z]+|.)")
-FRACTION_PATTERN = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-# Text of each TeX command without an HTML entity of the same name and meaning
-SYMBOLS = {
-    "cdot": "·",
-    "sqrt": "√",
-    "to": "→",
-    "neq": "≠",
-    "infty": "∞",
-    "circ": "°",
-    "sim": "~",
-    "quad": " ",
-    "ldots": "…",
-    "degree": "°",
-    ",": " ",
-    ";": " ",
-    **dict.fromkeys(("hat", "bar", "mathrm", "mathbf", "text", "left", "right", "!"), ""),
-}
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
@@ -69,9 +46,9 @@ def write(page: Page, notes: str) -> None:
     r"""Write Markdown on a page as plain text.
 
     >>> page = Page()
-    >>> write(page, "# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")
+    >>> write(page, "# A *b*\n\n- σ_z² is `R`\n\n![a map](m.png)")
     >>> [block["text"] for block in page.blocks]
-    ['A b', 'σ_z^2 is R', '[picture: a map]']
+    ['A b', 'σ_z² is R', '[picture: a map]']
     """
     from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
 
@@ -90,7 +67,6 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    markdown.inline.ruler.before("escape", "maths", _parse_maths)
     tokens = markdown.parse(notes)
     all_tokens = (
         nested_token for token in tokens for nested_token in (token, *(token.children or ()))
@@ -150,8 +126,6 @@ def _node_text(node: SyntaxTreeNode) -> str:
             return node.content
         case "softbreak" | "hardbreak" | "html_inline":
             return {"softbreak": " ", "hardbreak": "\n"}.get(node.type, "")
-        case "maths":
-            return _tex_to_text(node.content)
         case "image":
             return f"[picture: {node.content}]" if node.content else "[picture]"
         case "link":
@@ -159,25 +133,3 @@ def _node_text(node: SyntaxTreeNode) -> str:
             return label if label in (address, "") else f"{label} ({address})"
         case _:
             return _inline_text(node)
-
-
-def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Parse mathematics between dollar signs: a rule of markdown-it."""
-    maths_match = MATHS_PATTERN.match(state.src, state.pos)
-    if maths_match is None:
-        return False
-    if not silent:
-        state.push("maths", "", 0).content = (maths_match[1] or maths_match[2]).strip()
-    state.pos = maths_match.end()
-    return True
-
-
-def _tex_to_text(maths: str) -> str:
-    text = COMMAND_PATTERN.sub(_maths_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
-    return text.translate(str.maketrans("{}~", "() "))
-
-
-def _maths_symbol(command_match: re.Match[str]) -> str:
-    """Return the Unicode character of a TeX command, often the HTML entity of the same name."""
-    name = command_match[1]
-    return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

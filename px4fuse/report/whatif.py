@@ -146,9 +146,9 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            f"Not predictable: more than {MAX_REJECTED_FRACTION:.0%} of the samples would "
-            f"be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would change "
-            f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s."
+            f"A result is not predictable if more than {MAX_REJECTED_FRACTION:.0%} of the "
+            f"samples would be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would "
+            f"change it, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 

@@ -6,7 +6,7 @@ ignored.
 
 import json
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -341,7 +341,7 @@ def schema() -> dict[str, Any]:
     }
 
 
-def schema_of_types(types: Collection[type]) -> tuple[Sequence[dict[str, Any]], dict[str, Any]]:
+def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the JSON Schema of each type, and the definitions to which these schemas refer."""
     kinds = dict.fromkeys(types)
     schemas: tuple[dict[str, Any], ...] = ()
@@ -360,7 +360,7 @@ def schema_of_types(types: Collection[type]) -> tuple[Sequence[dict[str, Any]], 
         schemas, components = msgspec.json.schema_components(
             list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
         )
-    return schemas[: len(types)], components
+    return list(schemas[: len(types)]), components
 
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:

@@ -217,9 +217,8 @@ def mean_imu_at_rest(
     force_m_s2 = truth.specific_force_m_s2[0] + accelerometer_bias_m_s2
     force_m_s2 += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
     rate_rad_s = truth.angular_rate_rad_s[0] + gyro_bias_rad_s
-    return force_m_s2, rate_rad_s + noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(
-        3
-    )
+    rate_rad_s += noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(3)
+    return force_m_s2, rate_rad_s
 
 
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:

@@ -66,9 +66,9 @@ def has_other_body(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     difference = aligned_estimate.rotation.inv() * reference.rotation
-    constant = difference.mean()
-    deviation_rad = (constant.inv() * difference).magnitude()
+    mean_difference = difference.mean()
+    deviation_rad = (mean_difference.inv() * difference).magnitude()
     return bool(
-        constant.magnitude() > MIN_BODY_ROTATION_RAD
+        mean_difference.magnitude() > MIN_BODY_ROTATION_RAD
         and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
     )

@@ -58,20 +58,17 @@ def associate(
     Parameters
     ----------
     method : {"interpolate", "nearest"}
-        "interpolate": interpolate the reference at the times of the estimate, positions linearly
-        and rotations by slerp. "nearest": pair each pose of the trajectory with fewer poses with
-        the pose of the other trajectory that is nearest in time, as the evo package does. Poses of
-        the other trajectory may be used twice.
+        "interpolate": interpolate the reference at the times of the estimate. "nearest": pair each
+        pose of the trajectory with fewer poses with the nearest pose in time, as evo does.
     max_gap_s : float, optional
-        See :class:`Association`; by default three median intervals of the reference and at least
-        0.1 s, and 0.01 s for "nearest".
+        See :class:`Association`; default: :func:`gap_limit`, or 0.01 s for "nearest".
     time_offset_s : float
         Time offset added to the timestamps of the estimate.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three poses match. The message contains the time spans of both trajectories.
+        Fewer than three poses match.
     """
     time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":

@@ -66,7 +66,7 @@ def autocovariance(values: Array | Complex) -> Array:
 
     ``values``: shape (n,), real or complex.
     """
-    return np.asarray(_correlate(values, values)[len(values) - 1 :].real)
+    return _correlate(values, values)[len(values) - 1 :].real
 
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:

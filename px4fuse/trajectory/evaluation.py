@@ -258,10 +258,10 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             else "the trajectory kind is unknown"
         )
         frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
-    monocular = [
+    monocular_names = [
         track.name for track in (estimate, reference) if _MONOCULAR_NAME.search(track.name)
     ]
-    scale_reasons = [f"{name} is monocular according to the file name" for name in monocular]
+    scale_reasons = [f"{name} is monocular according to the file name" for name in monocular_names]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reasons.append(
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
@@ -339,7 +339,7 @@ def _comparison_warnings(
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
-    # A scale is also estimated if the motion does not determine the rotation
+    # fit_alignment would raise an error if the motion does not determine the rotation
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
     has_motion = np.ptp(reference.position_m, axis=0).any()
     if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
@@ -384,25 +384,26 @@ def _move_to_reference_body(
     for _ in range(ITERATIONS):
         transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
-        body = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
+        body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
         centred_axes = reference.rotation.as_matrix()
         centred_axes = centred_axes - centred_axes.mean(axis=0)
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
         arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
-        shift_m = (estimate.rotation * body).apply(arm_m) / transform.scale
+        shift_m = (estimate.rotation * body_rotation).apply(arm_m) / transform.scale
         corrected = replace(
             estimate,
             position_m=estimate.position_m - shift_m,
-            rotation=estimate.rotation * body,
+            rotation=estimate.rotation * body_rotation,
         )
     components = ", ".join(
         f"{value:+.2f} m along {axis}" for value, axis in zip(arm_m, "xyz", strict=True)
     )
     return corrected, (
-        f"The orientations differ by a constant {np.degrees(body.magnitude()):.1f}°: the estimate "
-        "has other body axes than the reference, for example those of a camera. Its origin is at "
-        f"{components} of the reference body. Both are corrected before the errors are computed.",
+        f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
+        "estimate has other body axes than the reference, for example those of a camera. Its "
+        f"origin is at {components} of the reference body. Both are corrected before the "
+        "errors are computed.",
     )
 
 

@@ -144,6 +144,10 @@ class Trajectory:
         }
         return replace(self, **selected)
 
+    def between(self, start_s: float, end_s: float) -> Trajectory:
+        """Return the poses from ``start_s`` to ``end_s``, possibly none."""
+        return self[(self.time_s >= start_s) & (self.time_s <= end_s)]
+
     def with_positions(
         self, position_m: Array, world_rotation: Rotation | None = None
     ) -> Trajectory:

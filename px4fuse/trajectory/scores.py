@@ -286,22 +286,8 @@ def rmse_interval(
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
-    times of the squared errors. Percentiles are widened according to Student's t for the number of
-    blocks (Hesterberg 2015, section 5.3).
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n,)
-        Errors in order of time.
-    analysis_name : str
-        Name of the score, for Unavailable.
-    min_block : int
-        Minimum block length: the number of pairs that overlap, because overlap correlates errors.
-
-    Returns
-    -------
-    Interval or Unavailable
-        Unavailable with fewer than five blocks.
+    times. Percentiles are widened for a small number of blocks (Hesterberg 2015, section 5.3).
+    ``min_block`` is the number of pairs that overlap, because overlap correlates errors.
     """
     squares = errors**2
     n = len(squares)

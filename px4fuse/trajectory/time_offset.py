@@ -1,13 +1,8 @@
 """Time offset between two recordings of the same motion: search over all lags, then least squares.
 
-Two series are correlated at all lags (:mod:`~px4fuse.trajectory.correlation`). The best lag is
-refined by least squares. It is rejected if the residual of another lag is less than
-:data:`MIN_SECOND_PEAK_RATIO` times larger.
-
-This module compares trajectories, which may have any frame and scale: their speeds are correlated,
-and a similarity transform is fitted. :mod:`px4fuse.alignment.time_and_pose_fit` compares a position
-file with EKF2 or the IMU. A position file is in metres with z vertical and has outliers: horizontal
-positions are correlated, and yaw and origin are fitted robustly.
+The speeds of both trajectories are correlated at all lags, because they do not depend on frame and
+scale. The best lag is refined with a similarity transform, and rejected if another lag fits nearly
+as well.
 """
 
 from dataclasses import dataclass
@@ -101,18 +96,12 @@ def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | Non
 def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOffset:
     """Estimate the time offset between two trajectories of the same motion.
 
-    Speeds, and angular speeds if both trajectories have orientations, do not depend on the frame.
-    The peaks of their masked correlation over all lags (Padfield 2012; Furrer 2017) are the
-    candidates. The candidate with the smallest ATE after a similarity alignment is refined by
-    minimising the ATE. The 95 % interval is from linearised least squares, with the long-run
-    variance of the score (Newey & West 1987), because pose errors are correlated.
+    Candidates are the peaks of the correlation of speeds and angular speeds (Padfield 2012; Furrer
+    2017). The candidate with the smallest ATE after a similarity alignment is refined by minimising
+    the ATE. The 95 % interval allows for correlated pose errors (Newey & West 1987).
 
-    Returns
-    -------
-    TimeOffset
-        Not determined without motion, or if other offsets fit equally well. Also not determined
-        with constant speed along a line or circle: a time offset is then equivalent to another
-        position or rotation.
+    With constant speed along a line or circle the offset cannot be determined: it is equivalent to
+    another position or rotation.
     """
     # The trajectory with the shorter pose intervals is interpolated
     if median_interval(estimate.time_s) >= median_interval(reference.time_s):
@@ -252,13 +241,13 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
         correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
     mean_correlation = np.mean(correlations, axis=0)
     local_maximum = maximum_filter1d(mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1)
-    order = np.flatnonzero(
+    peak_indices = np.flatnonzero(
         (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
     )
-    order = order[np.argsort(-mean_correlation[order])][:MAX_CANDIDATES]
+    peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
     # At index k the first sample of sparse is at sample k - (n - 1) of dense
     lags_s = (
-        (order - (len(is_known_sparse) - 1)) * step_s
+        (peak_indices - (len(is_known_sparse) - 1)) * step_s
         + float(dense_track.time_s[0])
         - float(sparse_track.time_s[0])
     )

@@ -24,36 +24,22 @@ FROM_CHORDAL = "chordal initialisation"
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Poses (vertices) and measurements of relative poses (edges).
-
-    Attributes
-    ----------
-    dimension : int
-        2 or 3.
-    ids : ndarray of int, shape (n,)
-        Vertex numbers of the file, in ascending order.
-    poses : ndarray, shape (n, 3) or (n, 7)
-        x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the frame of the
-        graph. Quaternions are normalised.
-    first, second : ndarray of int, shape (m,)
-        Indices into ``poses`` of the two vertices of each edge.
-    measurements : ndarray, shape (m, 3) or (m, 7)
-        Measured pose of ``second`` relative to ``first``, in the axes of ``first``.
-    information : ndarray, shape (m, 3, 3) or (m, 6, 6)
-        Inverse covariance of the measurement error in the axes of the measured pose, translation
-        before rotation, in 1/m² and 1/rad². Positive semidefinite: zero in directions that are not
-        measured.
-    initialised : str
-        Source of the poses.
-    """
+    """Poses (vertices) and measurements of relative poses (edges), in m and rad."""
 
     dimension: int
+    # Vertex numbers of the file, in ascending order
     ids: IntArray
+    # x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
     poses: Array
+    # Indices into ``poses`` of the two vertices of each edge
     first: IntArray
     second: IntArray
+    # Measured pose of ``second`` relative to ``first``, in the axes of ``first``
     measurements: Array
+    # Inverse covariance of each measurement, translation before rotation, in the axes of the
+    # measured pose; zero in directions that are not measured
     information: Array
+    # Source of the poses
     initialised: str = FROM_FILE
 
     __repr__ = one_line_repr
@@ -63,12 +49,12 @@ class PoseGraph:
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
         """Return the graph with only the edges in the mask, shape (m,)."""
-        edges = ("first", "second", "measurements", "information")
-        return replace(self, **{name: getattr(self, name)[is_selected] for name in edges})
+        edge_fields = ("first", "second", "measurements", "information")
+        return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Length of a tangent: 3 in the plane, 6 in space."""
+        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
     @property
@@ -112,21 +98,10 @@ def cost(graph: PoseGraph) -> float:
 
 
 def information_eigenvectors(information: Array) -> tuple[Array, Array]:
-    """Return the directions in which a measurement has information, and their variances.
+    """Return the directions (columns) in which a measurement has information, and the variances.
 
-    Translation and rotation have different units, so the information matrix is scaled to unit
-    diagonal before its eigenvalues are compared with zero.
-
-    Parameters
-    ----------
-    information : ndarray, shape (d, d)
-
-    Returns
-    -------
-    directions : ndarray, shape (d, k)
-        Columns; the measurement determines ``directions' r``. k is the rank of the matrix.
-    variance : ndarray, shape (k,)
-        ``information == directions @ diag(1 / variance) @ directions.T``.
+    ``information == directions @ diag(1 / variance) @ directions.T``. Translation and rotation have
+    different units, so the matrix is scaled to unit diagonal first.
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
     values, vectors = np.linalg.eigh(scaled_information)
@@ -135,10 +110,7 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Return the square roots of the diagonals, and the matrices scaled to unit diagonal.
-
-    A zero on the diagonal stays zero.
-    """
+    """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     return scale, matrices * (inverse[..., :, None] * inverse[..., None, :])
@@ -153,10 +125,12 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    ends = (graph.first[is_informative], graph.second[is_informative])
-    n = len(graph)
-    links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
-    component_count, component = connected_components(links, directed=False)
+    connected_nodes = (graph.first[is_informative], graph.second[is_informative])
+    node_count = len(graph)
+    adjacency = sparse.coo_array(
+        (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
+    )
+    component_count, component = connected_components(adjacency, directed=False)
     if component_count > 1:
         other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
         raise TrajectoryError(

@@ -43,33 +43,21 @@ _MAX_TRUNCATION_ROUNDS = 20
 
 
 class Solution(Record, frozen=True, kw_only=True):
-    """Solution of a pose graph: costs, iterations, dropped edges, poses and weights.
+    """Solution of a pose graph."""
 
-    Attributes
-    ----------
-    cost_initial : float
-        Half of the sum of the squared Mahalanobis distances at the initial poses, with all weights
-        1.
-    cost : float
-        Half of the weighted sum of the squared Mahalanobis distances at the solution.
-    iterations : int
-        Number of accepted steps, over all starts and stages.
-    converged : bool
-        True if the last step changed the cost by less than the tolerance.
-    dropped : int
-        Number of edges with a weight below 0.5.
-    poses : ndarray, shape (n, 3) or (n, 7)
-        Optimised poses; the first pose is unchanged.
-    weights : ndarray, shape (m,)
-        Factors on the information of each edge, from 0 (ignored) to 1.
-    """
-
+    # Half of the sum of the squared Mahalanobis distances at the initial poses
     cost_initial: NotNegative
+    # Half of the weighted sum of the squared Mahalanobis distances at the solution
     cost: NotNegative
+    # Number of accepted steps, over all starts and stages
     iterations: Count
+    # True if the last step changed the cost by less than the tolerance
     converged: bool
+    # Number of edges with a weight below 0.5
     dropped: Count
+    # Optimised poses; the first pose is unchanged
     poses: NotWritten[Array] = NOT_WRITTEN
+    # Factor on the information of each edge, from 0 (ignored) to 1
     weights: NotWritten[Array] = NOT_WRITTEN
 
 
@@ -148,32 +136,33 @@ def _minimise(
             -state.residual[..., None],
         )
         while True:
-            drop = 0.0
-            predicted_drop = 0.0
+            cost_decrease = 0.0
+            predicted_decrease = 0.0
             is_flat = False
             step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
-                predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
+                predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
-                trial = model.residuals(
+                trial_state = model.residuals(
                     graph, lie.compose(state.poses, lie.exp(tangent.reshape(len(graph), -1)))
                 )
-                drop = cost - float(np.sum(0.5 * weights * trial.chi2))
-                is_flat = abs(drop) < tolerance * cost
+                cost_decrease = cost - float(np.sum(0.5 * weights * trial_state.chi2))
+                is_flat = abs(cost_decrease) < tolerance * cost
             is_accepted = (
-                predicted_drop > _FLOAT_EPSILON * cost and drop > _MIN_FIDELITY * predicted_drop
+                predicted_decrease > _FLOAT_EPSILON * cost
+                and cost_decrease > _MIN_FIDELITY * predicted_decrease
             )
             if is_accepted or is_flat or damping >= _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
             return _Minimum(state, iterations, is_flat)
-        state = trial
+        state = trial_state
         cost_before = cost
-        cost = cost - drop
+        cost = cost - cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
-        if drop <= max(tolerance * cost_before, _TOLERANCE):
+        if cost_decrease <= max(tolerance * cost_before, _TOLERANCE):
             return _Minimum(state, iterations, True)
     return _Minimum(state, iterations, cost <= _TOLERANCE)
 
@@ -208,14 +197,14 @@ def _solve_gnc(
         solutions.append((truncated_cost(minimum.state, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped = np.flatnonzero(weights == 0.0)
-    for edge in dropped[np.argsort(minimum.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
+    for edge_index in dropped[np.argsort(minimum.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
         trial_weights = weights.copy()
-        trial_weights[edge] = 1.0
-        trial = _minimise(graph, minimum.state, trial_weights)
-        iteration_count += trial.iterations
-        if (cost := truncated_cost(trial.state, trial_weights)) < lowest_cost:
+        trial_weights[edge_index] = 1.0
+        retried = _minimise(graph, minimum.state, trial_weights)
+        iteration_count += retried.iterations
+        if (cost := truncated_cost(retried.state, trial_weights)) < lowest_cost:
             lowest_cost = cost
-            minimum = trial
+            minimum = retried
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
     return _Minimum(minimum.state, iteration_count, minimum.converged), weights
@@ -233,9 +222,9 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
             # avoids a division by zero; the weight is 1 anyway
             ratio = np.maximum(state.chi2 / bound, 1e-200)
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
-            stage = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
-            state = stage.state
-            iteration_count = iteration_count + stage.iterations
+            stage_minimum = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
+            state = stage_minimum.state
+            iteration_count = iteration_count + stage_minimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             control *= _GNC_FACTOR

@@ -45,12 +45,14 @@ def normal_equations(
     matrix : csc_array, shape ((n - 1) d, (n - 1) d)
     right_side : ndarray, shape ((n - 1) d, k)
     """
-    edges = np.arange(len(graph.first) + 1)
+    edge_indices = np.arange(len(graph.first) + 1)
     d = value.shape[1]
-    ends = np.column_stack([graph.first, graph.second]).ravel()
+    edge_nodes = np.column_stack([graph.first, graph.second]).ravel()
     blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
-    rows = sparse.bsr_array((blocks, ends, 2 * edges), shape=(d * edges[-1], d * len(graph)))
-    weights = sparse.bsr_array((information, edges[:-1], edges))
+    rows = sparse.bsr_array(
+        (blocks, edge_nodes, 2 * edge_indices), shape=(d * edge_indices[-1], d * len(graph))
+    )
+    weights = sparse.bsr_array((information, edge_indices[:-1], edge_indices))
     columns = rows.tocsc()
     first_columns = columns[:, :d]
     free_columns = columns[:, d:]
