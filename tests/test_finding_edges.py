@@ -30,6 +30,7 @@ from findings_tools import (
     severity,
     source,
     statement,
+    tried,
     tuned,
     with_bias,
 )
@@ -527,6 +528,21 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
     assert "estimated from positions and IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
+
+
+@pytest.mark.parametrize("noise_is_wrong", [False, True])
+@pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
+def test_heading_error_with_wrong_gnss_noise_names_this_noise(degrees, noise_is_wrong) -> None:
+    """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
+    trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
+    one = analysis(
+        heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS),
+        trials=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
+    )  # fmt: skip
+    finding = only(source_frame.detect, one)
+    text = f"{finding.message} {finding.remedy}"
+    assert ("magnetometer away" in text) is not noise_is_wrong
+    assert ("Set EKF2_GPS_P_NOISE to 0.4 m" in finding.remedy) is noise_is_wrong
 
 
 def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:

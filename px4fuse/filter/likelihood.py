@@ -1,7 +1,7 @@
 """KF with one prediction per position measurement, and 95 % intervals from the likelihood.
 
-The input is integrated between measurements, so KF does not need one prediction per DT. The results
-equal those of :mod:`px4fuse.filter.kalman` to 1e-9 for SIGMA_A and SIGMA_Z of at least 1e-3.
+The input is integrated between measurements, so KF needs no prediction per DT. With SIGMA_A
+and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from __future__ import annotations

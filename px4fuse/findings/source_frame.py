@@ -5,8 +5,10 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
+from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
@@ -20,8 +22,8 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of the heading drift against ground truth to that against the positions, for a drift
-# of EKF2's heading
+# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions; if
+# the ratio is smaller, the heading of the positions drifts
 MIN_TRUE_DRIFT_FRACTION = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
@@ -90,7 +92,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
-        action = f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
+        _, action = _gnss_heading_fault(analysis)
     elif analysis.source.name == IN_EKF2_FRAME:
         reason = "EKF2 fused the positions in this frame. The IMU measures another direction."
         action = "Align the positioning frame with north."
@@ -113,6 +115,15 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
+
+
+def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
+    """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
+    if (trial := confirmed_noise_trial(analysis)) is not None:
+        cause = f"the wrong {aid_of(analysis).noise}, which weights GNSS against the magnetometer"
+        return cause, f"Set {format_settings(trial.change)}, then check the heading again."
+    cause = "a magnetometer near currents or steel"
+    return cause, f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
 
 
 def _calibrate(analysis: Analysis) -> str:
@@ -159,7 +170,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     if has_yaw and not is_fused:
         action = f"{let} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
-        possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
+        calibrate = ""
+        possible_cause, action = _gnss_heading_fault(analysis)
     elif action and not analysis.flight.log.has_ulog:
         action = f"{let} the autopilot fuse the yaw of the source."
     return finding(

@@ -287,6 +287,7 @@ RECORD_NOT_LOGGED = Unavailable(
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+DEAD_RECKONING = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
@@ -320,7 +321,8 @@ class FusionRecord:
     # Updates of the height bias of each aiding source relative to the height reference: ``bias_m``
     # and ``bias_m2`` after the update, ``innovation_m`` and its ``variance_m2``
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # 1 while EKF2 detects GROUND_EFFECT on the barometer, or BAD_ACCELERATION (vertical)
+    # 1 while EKF2 reports GROUND_EFFECT on the barometer, BAD_ACCELERATION (vertical), or inertial
+    # DEAD_RECKONING
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
