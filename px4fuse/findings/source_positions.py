@@ -63,7 +63,7 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of one of many jumps without a change of reset_counter
 MIN_SMALL_JUMP_M = 0.1
-# Minimum size of such a jump in medians of the differences of successive steps
+# Minimum size of one of many jumps in medians of the differences of successive steps
 MIN_STEP_RATIO = 8.0
 # Number of differences for the median
 NOISE_SAMPLES = 61
