@@ -65,6 +65,7 @@ IDS_FROM_LOGS = {
     "ekf2_gps_delay_wrong",
     "ekf2_not_aligned",
     "gyroscope_bias",
+    "imu_values_impossible",
     "parameter_changed",
     "source_height_only",
     "source_relocalises",

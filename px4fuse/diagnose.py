@@ -291,7 +291,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # only the default change needs the estimates of a comparison
+    except MissingDataError:  # given changes need no estimates
         if is_default_change:
             raise
     if comparison is not None:

@@ -124,12 +124,18 @@ def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     )  # fmt: skip
     logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_fraction_replayed=0.3)  # fmt: skip
-    for all_known in (False, True):
-        found = with_logged_rejections(own_gate, logged_gate, has_all_decisions=all_known)
-        assert found.good is good
-        assert found.reason.startswith("in a replay with EKF2's logged rejections, ")
-        assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
-        assert found.axes == (logged_gate if all_known else own_gate).axes
+    found = with_logged_rejections(own_gate, logged_gate)
+    assert found.good is good
+    assert found.reason.startswith("in a replay with EKF2's logged rejections, ")
+    assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
+    assert found.axes == logged_gate.axes
+    # above half of the positions the published position is not tested, but the correlation is
+    mostly = replace(own_gate, rejected_fraction_logged=0.51)
+    assert with_logged_rejections(mostly, replace(logged_gate, east=agreeing(published_m=9.0))).good
+    refused = with_logged_rejections(mostly, replace(logged_gate, east=agreeing(0.98)))
+    assert not refused.good
+    assert "0.9800" in refused.reason
+    assert "rejected 51% of the positions and relied on the IMU" in refused.reason
 
 
 def test_ekf2_replay_agreement_statistics_equal_their_formulas():

@@ -23,7 +23,6 @@ from px4fuse.ekf2.inputs import (
     Inputs,
     ReceivedPositions,
     _logged_decisions,
-    _position_corrections,
     _vision_track,
     prepare_inputs,
     read_vision,
@@ -39,7 +38,6 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
-    EV_POS,
     GNSS_POS,
     PARAMETERS,
     check_parameters,
@@ -47,6 +45,8 @@ from px4fuse.flight.ekf2_parameters import (
     fuses_by_mask,
 )
 from px4fuse.flight.model import (
+    DEAD_RECKONING,
+    AidLog,
     Columns,
     Ekf2,
     Flight,
@@ -210,7 +210,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         ({"EKF2_AID_MASK": 8.0}, 0.0, False),
     ):  # fmt: skip
         ages = pd.Series([0.05, 0.15], index=[time[0], time[-1]])
-        record = made(FusionRecord, parameters=parameters, vision_age_s=ages)
+        record = made(FusionRecord, parameters=parameters, vision_age_s=ages, states={})
         ekf2 = made(
             Ekf2, fusion_flags=pd.DataFrame({"yaw": [0.0, yaw]}), innovations={"north": NONE},
             record=record, horizon_s=0.1, innovation_topics=AID,
@@ -242,50 +242,53 @@ def test_logged_rejections_are_matched_by_measurement_time():
         Reset(float(shown[4]), "position", (0.0, 1.0, 0.0)),
         Reset(float(shown[5]) + 0.1, "position", (0.0, 1.0, 0.0)),  # this sample was fused
     )
-    record = made(FusionRecord, parameters={"EKF2_EV_DELAY": 50.0})
+    record = made(FusionRecord, parameters={"EKF2_EV_DELAY": 50.0}, states={})
     parts = {
         "innovations": {"north": logged}, "horizon_s": 0.1, "step_s": 0.01, "resets": resets,
-        "innovation_topics": AID,
+        "innovation_topics": AID, "aids": {"ev_pos": made(AidLog, samples=logged)}, "states": {},
     }  # fmt: skip
-    rejected, reset = _logged_decisions(made(Ekf2, **parts), record, stamp)
+
+    def decisions(**other: Any) -> Any:
+        return _logged_decisions(made(Ekf2, **parts | other), record, stamp, stamp - 1.0)
+
+    rejected, reset = decisions()
     assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
     assert reset.tolist() == [True, False, False, False, True, False]
     logged.loc[logged.index[5], "innovation_m"] = 0.0  # EKF2 logs a reset with innovation 0
-    assert _logged_decisions(made(Ekf2, **parts), record, stamp)[1][5]
+    assert decisions()[1][5]
     for other in ({"innovation_topics": ()}, {"horizon_s": NONE}, {"innovations": {"north": NONE}}):
-        rejected, reset = _logged_decisions(made(Ekf2, **{**parts, **other}), record, stamp)
+        rejected, reset = decisions(**other)
         assert np.isnan(rejected).all()
         assert not reset.any()
 
 
+def test_logged_decisions_follow_from_time_of_last_fusion():
+    """Rows at 0.5 and 1 s of samples at 10 Hz; EKF2 fused at 0.2 s and reset its position at 1.3 s.
+
+    Inertial dead reckoning lasts from 1.2 s, which is 1 s after the last fusion, to 1.3 s.
+    """
+    taken = 0.1 * np.arange(16)
+    columns = {"rejected": [1.0, 1.0], "innovation_m": 1.0, "last_fused_s": 0.203}
+    logged = pd.DataFrame(columns, index=[0.5, 1.0])
+    steps = pd.Series([0.0, 1.0, 0.0], index=[0.0, 1.203, 1.303])
+    ekf2 = made(
+        Ekf2, innovations={"north": logged}, horizon_s=0.1, step_s=0.0, innovation_topics=AID,
+        resets=(Reset(1.52, "position", (1.0, 0.0, 0.0)),),
+        aids={"ev_pos": made(AidLog, samples=logged)},
+        states={"ev_pos": pd.Series([1.0], index=[0.0])},
+    )  # fmt: skip
+    for states, resets_at in (({DEAD_RECKONING: steps}, 13), ({}, 14)):
+        record = made(FusionRecord, parameters={}, states=states)
+        rejected, reset = _logged_decisions(ekf2, record, taken, taken - 1.0)
+        assert rejected[2] == 0.0
+        known = 13 if states else 11
+        assert_array_equal(rejected[3:known], 1.0)
+        assert np.isnan(rejected[known:]).all()
+        assert np.isnan(rejected[:2]).all()
+        assert np.flatnonzero(reset).tolist() == [resets_at]
+
+
 # ---------------------------------------------------------------- segments
-
-
-def test_ekf2_position_corrections_by_fusion_exclude_resets():
-    """EKF2 flies north at 2 m/s and is reset 3 m east at 5 s; one of three decisions is logged."""
-    times = np.arange(0.0, 10.0, 0.1)
-    state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
-    state["north_m"], state["north_m_s"], state["east_m"] = 2.0 * times, 2.0, 3.0 * (times >= 5.0)
-    reset = Reset(5.0, "position", (0.0, 3.0, 0.0))
-    stamp_s, logged = np.arange(1.075, 8.0, 0.1), np.tile([1.0, np.nan, np.nan], 24)[:70]
-    settings = {"EKF2_EV_DELAY": 50.0, "EKF2_TAU_POS": 0.25}
-
-    def moved(*resets: Reset, rejected: Any = logged, arrival_s: Any = stamp_s) -> Any:
-        received = made(ReceivedPositions, stamp_s=stamp_s, arrival_s=arrival_s, rejected=rejected)
-        innovations = {"north": pd.DataFrame({"rejected": [np.nanmax(rejected)]})}
-        ekf2 = made(
-            Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01, innovations=innovations
-        )
-        return _position_corrections(ekf2, received, settings, EV_POS)
-
-    assert_allclose(moved(reset), 0.0, atol=1e-9)
-    assert np.nanmax(moved()) > 1.0
-    # a sample that arrives late is fused late
-    late = moved(arrival_s=stamp_s + 0.3)
-    assert np.nanargmax(late[:, 1]) == np.nanargmax(moved()[:, 1]) - 2
-    # no correction if nothing is rejected, or all decisions are logged
-    assert moved(reset, rejected=0.0 * logged) is None
-    assert moved(reset, rejected=np.ones(70)) is None
 
 
 @pytest.mark.parametrize(("interval_ms", "known", "ends"), [
@@ -337,7 +340,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     })  # fmt: skip
     delayed["attitude_down_rad2"] = states
     state = pd.DataFrame(7.0, index=time, columns=Columns.STATE).assign(down_m=time)
-    record = made(FusionRecord, delayed=delayed, parameters={})
+    record = made(FusionRecord, delayed=delayed, parameters={}, states={})
     return imu, attitude, made(Ekf2, state=state), record
 
 
@@ -382,6 +385,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
         return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_HISTORY_S", 0.0)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from px4fuse.diagnose import run_what_if
 from px4fuse.ekf2.model import open_model
 from px4fuse.flight.model import Unavailable
 from px4fuse.readers import read_log
+from px4fuse.request import WhatIfRequest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
@@ -45,3 +47,48 @@ def test_ekf2_model_states_fraction_of_missing_imu_samples(shared_logs):
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)
     assert "23 % of the IMU samples are missing" in found.reason
+
+
+# Minimum correlation of replayed and logged innovations, with EKF2's rejections and resets
+REJECTING_FLIGHTS = {
+    "conventions/yaw_90_off": 0.999,
+    "conventions/quaternion_xyzw": 0.99,
+    "conventions/enu_uwb": 0.999,
+    "conventions/relocalised": 0.999,
+    "flown/v1_evp003": 0.99,
+    "flown/v2_gate15": 0.999,
+    "flown/g1_p01": 0.999,
+}
+
+
+@pytest.mark.parametrize("name", REJECTING_FLIGHTS)
+def test_ekf2_replay_of_flights_with_rejections_agrees(shared_logs, name):
+    model = open_model(read_log(shared_logs / f"{name}.ulg"))
+    assert not isinstance(model, Unavailable)
+    assert model.agreement.good
+    correlations = [axis.innovation_correlation for axis in model.agreement.axes.values()]
+    assert min(correlations) > REJECTING_FLIGHTS[name]
+
+
+def test_ekf2_replay_of_mirrored_flight_is_refused(shared_logs):
+    """EKF2 rejects 86 % of the positions, and its variance is reduced by unlogged samples."""
+    model = open_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
+    assert not isinstance(model, Unavailable)
+    assert not model.agreement.good
+    assert "rejected 86% of the positions and relied on the IMU" in model.agreement.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("eg1_base", {}),
+        ("eg1_evp20", {"EKF2_EVP_NOISE": 0.1}),
+        ("eg1_d0", {"EKF2_GPS_DELAY": 110.0}),
+        ("g1_d0", {"EKF2_GPS_DELAY": 110.0}),
+        ("g1_base", {}),
+    ],
+)
+def test_whatif_of_flown_flight_proposes_the_wrong_parameter(shared_logs, name, expected):
+    log = str(shared_logs / "flown" / f"{name}.ulg")
+    found = run_what_if(WhatIfRequest(log=log)).changes
+    assert found == pytest.approx(expected, abs=20.0 if "d0" in name else 0.01)

@@ -5,7 +5,7 @@ import pytest
 from findings_tools import made as made_of
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.output_predictor import corrections, follow_attitude, publish
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -68,35 +68,6 @@ def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
     expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
     for found, known in zip(made, expected, strict=True):
         assert found == pytest.approx(known, abs=1e-9)
-
-
-def test_ekf2_corrections_are_recovered_from_published_position() -> None:
-    """Corrections and rows have an interval of 0.1 s, as GNSS and the log."""
-    lag, tau_s, count = 15, 0.25, 60
-    rng = np.random.default_rng(3)
-    moved = rng.normal(0.0, 0.1, (count, 2)) * (rng.random((count, 1)) < 0.5)
-    n = 10 * count + 100
-    velocity, position = np.tile([1.5, -0.5], (n + 1, 1)), np.zeros((n + 1, 2))
-    at = 12 + 10 * np.arange(count)
-    position[at] = moved
-    position = np.cumsum(position + velocity * STEP_S, axis=0)
-    flat = np.zeros((n, 2))
-    still = np.zeros((n + 1, 2))
-    v, p = buffered(flat, velocity, position, still, lag, tau_s, tau_s)
-    rows, known_s = np.arange(0, n + 1, 10), (at + lag - 1) * STEP_S
-    found = corrections(rows * STEP_S, v[rows], p[rows], known_s, tau_s)
-    assert np.abs(moved).max() > 0.2
-    np.testing.assert_allclose(found, moved, atol=0.05)
-    assert np.corrcoef(found.ravel(), moved.ravel())[0, 1] > 0.97
-    # half a second of missing rows, and another without a position
-    rows = np.delete(rows, np.arange(20, 25))
-    p[400:450] = np.nan
-    partly = corrections(rows * STEP_S, v[rows], p[rows], known_s, tau_s)
-    lost = ~np.isfinite(partly[:, 0])
-    assert 5 <= lost[15:25].sum() <= 8
-    assert 3 <= lost[33:45].sum() <= 6
-    assert lost.sum() == lost[15:25].sum() + lost[33:45].sum()
-    np.testing.assert_allclose(partly[~lost], moved[~lost], atol=0.08)
 
 
 def test_ekf2_output_predictor_attitude_equals_its_recursion() -> None:

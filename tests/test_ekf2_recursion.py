@@ -97,7 +97,7 @@ def deciding(
         rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        rejected=np.array([logged]), reset=np.array([logged_reset]),
+        rejected=np.array([logged]), reset=np.array([logged_reset]), has_all_resets=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
@@ -232,26 +232,6 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-@pytest.mark.parametrize(("north_m", "share", "fused"), [
-    # close to the limit, the published motion decides
-    (2.5, 1.0, True), (2.5, 0.0, False), (2.53, 1.0, True), (2.53, 0.0, False),
-    # the motion is ambiguous, or the NIS is far from the limit: the gate of the replay decides
-    (2.5, 0.4, True), (2.53, 0.6, False), (2.0, 0.0, True), (3.3, 1.0, False),
-    # beyond MAX_LOG_RATIO the motion is not used
-    (1.5, -99.0, True), (4.2, 99.0, False),
-])  # fmt: skip
-def test_fusion_near_gate_is_derived_from_published_position(north_m, share, fused):
-    """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""
-    fixes = [0.0] * 10 + [north_m] + [0.0] * 9
-    done = on_gnss(fixes, [0.0] * 20)
-    S, R = done.innovation_variance[10, 0, 3], done.noise[10, 0, 3]
-    assert 5.0 * math.sqrt(S) == pytest.approx(2.515, abs=0.001)
-    moved = np.zeros((20, 2))
-    moved[10, 0] = share * (1.0 - R / S) * done.innovation[10, 0, 3]
-    assert bool(on_gnss(fixes, [0.0] * 20, correction_m=moved).fused[10, 0]) is fused
-    assert bool(done.fused[10, 0]) is (north_m < 2.515)
-
-
 def test_ekf2_replay_initial_correlation_equals_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
@@ -328,8 +308,7 @@ def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
 def at_rest(
     measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
-    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None,
-    reset_s: Any = (), **settings: float,
+    heading_rad: float = 0.0, field_gauss: Any = None, reset_s: Any = (), **settings: float,
 ) -> SegmentRun:  # fmt: skip
     """Run a level vehicle at rest at the origin, measured at 10 Hz at these north positions."""
     count = 10 * (len(measured_m) + 1)
@@ -359,7 +338,6 @@ def at_rest(
     exact = None if speed_m_s is None else np.zeros_like(speed_m_s)
     vision = replace(
         vision,
-        correction_m=correction_m,
         velocity_m_s=speed_m_s,
         velocity_variance_m2_s2=exact,
         reset_s=reset_s,

@@ -30,6 +30,7 @@ from findings_tools import (
     severity,
     source,
     statement,
+    tried,
     tuned,
     with_bias,
 )
@@ -61,7 +62,12 @@ from px4fuse.findings import (
     source_stamps,
 )
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
-from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
+from px4fuse.findings.model import (
+    SOURCE_WORDS,
+    fraction_on,
+    spans_with_value,
+    zero_length_spans,
+)
 from px4fuse.flight.log import ClockMap, Dropout
 from px4fuse.flight.model import Columns, Reset, Unavailable
 from px4fuse.flight.position_source import (
@@ -294,7 +300,8 @@ def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
 
 
 CHECK_FIRST = (
-    "Check line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+    "Check the data link and the line of sight to the anchors. Then check EKF2_EV_DELAY and "
+    "EKF2_EVP_NOISE. Increase EKF2_EVP_GATE last."
 )
 
 
@@ -312,12 +319,27 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
     main = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
     assert main.evidence["filter"] == "kf"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
-    assert finding.remedy == hidden_errors.SHARED_REMEDY
+    assert finding.remedy == (
+        "Check the time offset of the positions (px4fuse sync LOG). "
+        f"Then check {SOURCE_WORDS['uwb'].errors}."
+    )
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
         (0.27, hidden_errors.EKF2_REMEDY),
-        (0.28, hidden_errors.SHARED_REMEDY),
-        (0.4, hidden_errors.SHARED_REMEDY),
+        (
+            0.28,
+            (
+                "Check the time offset of the positions (px4fuse sync LOG). "
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
+            ),
+        ),
+        (
+            0.4,
+            (
+                "Check the time offset of the positions (px4fuse sync LOG). "
+                f"Then check {SOURCE_WORDS['uwb'].errors}."
+            ),
+        ),
     ):
         just = axis("east", kf=statement(2.0), kf_truth=against_truth(25.0, kf_rmse_m),
                     ekf2=statement(0.5), ekf2_truth=against_truth(25.0))  # fmt: skip
@@ -506,6 +528,21 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
     assert "estimated from positions and IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
+
+
+@pytest.mark.parametrize("noise_is_wrong", [False, True])
+@pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
+def test_heading_error_with_wrong_gnss_noise_names_this_noise(degrees, noise_is_wrong) -> None:
+    """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
+    trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
+    one = analysis(
+        heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS),
+        trials=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
+    )  # fmt: skip
+    finding = only(source_frame.detect, one)
+    text = f"{finding.message} {finding.remedy}"
+    assert ("magnetometer away" in text) is not noise_is_wrong
+    assert ("Set EKF2_GPS_P_NOISE to 0.4 m" in finding.remedy) is noise_is_wrong
 
 
 def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:

@@ -24,7 +24,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight.log import ClockMap, Dropout
-from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Ekf2, Flight, Reset, Unavailable
 from px4fuse.flight.position_source import ALIGNED
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest, PositionFile
@@ -230,6 +230,8 @@ FAULTS = [
     Fault("imu_samples_missing", "warning", {"lost_fraction": about(0.2, 0.01)},
           change=lambda f: replace(f, imu=f.imu.drop(f.imu.index[::5]))),
     Fault("imu_gap", "warning", {"total_s": about(2.0, 1e-6)}, {"imu": Imu(gap_s=(40.0, 42.0))}),
+    Fault("imu_values_impossible", "error", {"count": 1000},
+          change=lambda f: replace(f, imu=f.imu * (1.0 + 199.0 * (f.imu.index > 110.0))[:, None])),
     Fault("attitude_failure", "error", {"total_s": 4.0}, {"tumble_spans": ((100.0, 104.0),)}),
     Fault("accelerometer_clipping", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
           {"imu": Imu(clipped_s=(50.0, 50.295))}),
@@ -294,6 +296,41 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
 ]  # fmt: skip
 
 
+# Condition in the log for each action with these words
+PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
+    ("anchor|line of sight|the tag", lambda made, _: made.source.origin.kind == "uwb"),
+    ("texture|marker|camera", lambda made, _: made.source.origin.kind in ("vio", "mocap")),
+    ("--source-kind mocap", lambda made, _: made.source.origin.kind == "vio"),
+    ("Calibrate the magnetometer", lambda made, _: parameter(made, "EKF2_MAG_TYPE") != 5.0),
+    ("SD card", lambda made, one: bool(made.flight.log.dropouts) or one.id in CORRUPT_LOG),
+    (
+        "let EKF2 fuse the yaw",
+        lambda made, one: made.source.orientation is not None or "send the orient" in one.remedy,
+    ),
+    ("--position-yaw|--position-frame", lambda made, _: made.source.alignment is not None),
+    ("TIMESYNC", lambda made, _: made.source.origin.path == "as received"),
+]
+# Findings about a log that the SD card damaged
+CORRUPT_LOG = ("log_damaged", "imu_samples_missing")
+
+
+def parameter(comparison: Comparison, name: str) -> float:
+    if name == "EKF2_EVP_GATE" and isinstance(comparison.flight.ekf2, Ekf2):
+        return comparison.flight.ekf2.gate
+    return comparison.flight.log.parameters.get(name, math.nan)
+
+
+def check_action(comparison: Comparison, finding: Finding) -> None:
+    """Check that the log does not contradict the action of a finding."""
+    for words, is_met in PRECONDITIONS:
+        if re.search(words, finding.remedy):
+            assert is_met(comparison, finding), (words, finding.remedy)
+    for name, number in re.findall(
+        r"Set (EKF2_\w+|SDLOG_PROFILE) to ([\d.]+)(?!\d)", finding.remedy
+    ):
+        assert parameter(comparison, name) != float(number.rstrip(".")), finding.remedy
+
+
 def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]:
     """Find all faults of a comparison without re-runs, and check the form of each finding."""
     findings = find(with_noises(comparison) if tuned else unexplained(comparison))
@@ -304,6 +341,7 @@ def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]
         earlier_ids.add(finding.id)
         assert re.fullmatch(r"[A-Z0-9a-z].*[^.: ;]", finding.title)
         assert finding.message.startswith(finding.title)
+        check_action(comparison, finding)
         for text in filter(None, (finding.message, finding.remedy)):
             assert "\n" not in text
             assert text.endswith(".")

@@ -247,7 +247,7 @@ def test_batch_page_matches_reference_file() -> None:
 def test_explore_page_plots_match_reference_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
-    document, _ = document_json(data, analysis)
+    document, _ = document_json(data)
     ids: dict[str, str] = {}
 
     def number_bokeh_ids(found: re.Match[str]) -> str:

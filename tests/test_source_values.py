@@ -280,7 +280,15 @@ def test_two_senders_finding_removes_findings_that_depend_on_it():
     ]
     left = source_convention.apply_convention(analysis, findings)
     assert [one.id for one in left] == ["source_two_senders", "ekf2_not_fusing", "imu_gap"]
-    assert left[1].remedy == source_convention.CORRECT_FIRST.format("position source")
+    assert left[1].caused_by == "source_two_senders"
+
+
+def test_noise_along_one_axis_is_not_reported_as_two_senders():
+    flight = aisle_flight(uwb=Uwb(rate_hz=30.0, sigma_m=0.01))
+    samples = flight.positions[0].samples.copy()
+    samples["north_m"] += np.random.default_rng(9).normal(0.0, 0.4, len(samples))
+    analysis = unexplained(compare(with_track(flight, samples=samples)))
+    assert not [*source_values.detect_two_senders(analysis)]
 
 
 def mounted(arm_m: tuple[float, float]) -> Analysis:
@@ -293,6 +301,12 @@ def mounted(arm_m: tuple[float, float]) -> Analysis:
     samples[Columns.POSITION] += rotation @ [*arm_m, 0.0]
     analysis = unexplained(compare(with_track(flight, samples=samples)))
     return replace(analysis, convention=Convention(verdict="determined"))
+
+
+def test_lever_arm_that_does_not_reduce_the_error_is_not_reported(monkeypatch):
+    analysis = mounted((0.4, -0.3))
+    monkeypatch.setattr(source_values, "_replayed_effect", lambda *_: None)
+    assert not [*source_values.detect_lever_arm(analysis)]
 
 
 def test_estimated_lever_arm_equals_simulated_one():

@@ -155,9 +155,7 @@ def test_read_trajectory_states_gaps_and_repeated_timestamps(tmp_path: Path) -> 
 def test_read_trajectory_drops_incomplete_last_line(tmp_path: Path) -> None:
     got = read_trajectory(write(tmp_path, text(rows())[:-50]))
     assert len(got) == POSES - 1
-    assert (
-        "The last line of the position file was dropped, because it has no line end." in got.notes
-    )
+    assert "The last line of the position file was dropped, because it is incomplete." in got.notes
 
 
 TUM_ROWS = rows()

@@ -95,7 +95,7 @@ def test_whatif_command_without_set_keeps_parameters_that_fit(estimated: WhatIfA
     assert not estimated.changes
     assert not estimated.whatif.whatif
     texts = [str(block) for block in summary(estimated).blocks]
-    assert any("nothing is changed" in text for text in texts)
+    assert any("no parameter is changed" in text for text in texts)
     table, found = {label.strip(): cells for label, *cells in rows(estimated)}, estimated.whatif
     every = (found.logged, found.replayed)
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]

@@ -37,6 +37,8 @@ MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
+# Minimum rotation (°) of the frame of a position file to be named
+MIN_NAMED_YAW_DEG = 1.0
 
 
 def align_position_file(
@@ -297,10 +299,12 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    return (
+    rotation_text = (
         f"The frame of the position file is rotated by {yaw_deg:.1f}° against the {name}. "
-        f"{shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
+    if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG:
+        rotation_text = ""
+    return f"{rotation_text}{shift_text}Give --position-yaw auto to estimate yaw and origin."
 
 
 def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:

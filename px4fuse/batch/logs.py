@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
 #: Suffixes of the files in a folder that are logs; a file that the user names may have any suffix
-LOG_SUFFIXES = (".ulg", ".tlog", ".bin")
+LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
 
 
 @dataclass(frozen=True, order=True)
@@ -59,7 +59,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             info_by_path = {
                 path: info
                 for path, info in all_files.items()
-                if PurePosixPath(path).suffix.lower() in LOG_SUFFIXES
+                if path.lower().endswith(LOG_SUFFIXES)
             }
         # devices and pipes are included: the worker process that opens them reports an error
         elif file_system.exists(root):

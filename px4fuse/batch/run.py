@@ -219,9 +219,11 @@ def run(
                     _cache_outcome(state, log_by_address[job.address], outcome)
                     progress(f"comparing logs, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
-                batch_result = _write_table(state, logs)
+                if state.hash_by_address or state.failed_rows:
+                    batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            raise type(error)(f"{error} {RESUME_NOTE}") from error
+            is_kept = (output / "rows").is_dir()
+            raise type(error)(f"{error} {RESUME_NOTE if is_kept else ''}".rstrip()) from error
     return batch_result
 
 

@@ -60,6 +60,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "autopilot_restarted",
     "imu_samples_missing",
     "ekf2_not_fusing",
+    "parameter_changed",
 )
 # Ids of findings that only repeat a verdict on σ; the card lists them only if no other cause exists
 VERDICT_FINDINGS = frozenset(
@@ -89,7 +90,12 @@ TARGETS: Mapping[str, Target] = {
     "logging": "logging",
 }
 # Exceptions to TARGETS, by id of the finding
-TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
+TARGETS_BY_ID: Mapping[str, Target] = {
+    "source_drift": "source",
+    "source_lever_arm": "EKF2",
+    "source_height_only": "EKF2",
+    "ekf2_not_fusing": "sender",
+}
 
 
 class RankedCause(NamedTuple):

@@ -4,6 +4,7 @@ import atexit
 import errno
 import gc
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -204,6 +205,8 @@ def _prepare_libraries() -> None:
         os.environ.setdefault(name, value)
     for name in IGNORED_VARIABLES:
         os.environ.pop(name, None)
+    # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
         # pandas then assumes that pyarrow is not installed
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]

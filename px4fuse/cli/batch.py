@@ -72,7 +72,9 @@ def batch(
                 **option_values,
             )
     except KeyboardInterrupt as interrupt:
-        message = f"results of finished logs are in {output}. Run the same command to continue."
+        message = "no log was finished, and nothing was written."
+        if (output / "rows").is_dir():
+            message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print({}, format_summary(fleet), written_files=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()

@@ -12,10 +12,11 @@ from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import correct_convention, find_faults
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
-from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
+from px4fuse.filter.settings import CLOCK_OFFSET_RANGE_S, SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
+    HEIGHT_ONLY,
     Columns,
     Ekf2,
     Flight,
@@ -85,7 +86,9 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s
-    settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
+    # a time offset beyond the range of the settings is found at the edge of the searched range
+    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *CLOCK_OFFSET_RANGE_S))
+    settings = replace(settings, clock_offset_s=clock_offset_s)
     flight, track = correct_convention(flight, track, convention)
     track = _move_to_vehicle(track, flight)
     track = _use_origin_of_gnss(track, flight)
@@ -262,6 +265,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damage_text}no external position in this log (no {topics})"
+    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
+    if height_only is not None:
+        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY}"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"

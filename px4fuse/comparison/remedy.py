@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
@@ -24,11 +25,11 @@ TRANSMISSION_MS = 30.0
 DELAY_MAX_STEP_MS = 50.0
 
 
-def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
+def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     """Estimate the delay of GNSS and its σ (ms), if EKF2 fused vision and GNSS velocity.
 
     The delay minimises the NIS of GNSS in re-runs of EKF2 with other values of EKF2_GPS_DELAY.
-    Return None if the NIS has no minimum.
+    Return None if it does not differ significantly from the flown delay.
     """
     received = model.inputs.received
     if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
@@ -45,7 +46,12 @@ def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
         # mean NIS times a fixed number: the number of evaluated samples depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
     curvature, slope, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
-    return (-0.5 * slope / curvature, curvature**-0.5) if curvature > 0.0 else None
+    if curvature <= 0.0:
+        return None
+    estimate_ms, sigma_ms = -0.5 * slope / curvature, curvature**-0.5
+    limit_ms = max(1e3 * MIN_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
+    error_ms = abs(estimate_ms - model.inputs.settings[GNSS_POS.delay])
+    return (estimate_ms, sigma_ms) if error_ms > limit_ms and estimate_ms >= 0.0 else None
 
 
 def ml_ekf2_parameters(
@@ -60,15 +66,27 @@ def ml_ekf2_parameters(
     is not included for GNSS and odometry, because innovations do not show their slow errors. Empty
     if EKF2 did not fuse the analysed source.
     """
-    if not is_fused_source(comparison, model.inputs):
-        return {}
     changes: dict[str, float] = {}
-    inputs = model.inputs
+    inputs, min_vision_noise_m = model.inputs, 0.0
+    if inputs.vision is not None and comparison.source.name == inputs.vision.source:
+        if (gnss_delay := wrong_gnss_delay_ms(model)) is not None:
+            changes |= delay_change(inputs, gnss_delay[0])
+        # while EKF2 fuses GNSS, the noise of vision is at least that of GNSS
+        min_vision_noise_m = inputs.settings[GNSS_POS.noise]
+        inputs = replace(inputs, aid=EV_POS, received=inputs.vision)
+    if not is_fused_source(comparison, inputs):
+        return {}
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
-    min_noise_m = noise_used_m(inputs) if has_slow_errors else 0.0
-    if axis_tuning and noise_m and noise_m > min_noise_m:
+    used_m = noise_used_m(inputs)
+    min_noise_m = used_m if has_slow_errors else 0.0
+    if (
+        axis_tuning
+        and noise_m
+        and noise_m > min_noise_m
+        and (max(noise_m, used_m) > min_vision_noise_m)
+    ):
         changes |= ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
     return changes | ml_delay_change(comparison, inputs, clock)
 

@@ -13,7 +13,14 @@ from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
 from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
 from px4fuse.core.arrays import Array
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    kind_without_orientation,
+    time_index,
+)
 from px4fuse.trajectory.rotation import from_elements, heading
 
 # Smaller rotations (°) of a frame with wrong axes are not converted, but reported as heading error
@@ -159,7 +166,7 @@ def correct_convention(
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
     if faults.orientation == "copied" and origin.kind == "vio":
-        origin = structs.replace(origin, kind="uwb")
+        origin = structs.replace(origin, kind=kind_without_orientation(samples))
     if faults.orientation in ("copied", "heading"):
         orientation = None
     elif orientation is not None and convention.orientation is not None:

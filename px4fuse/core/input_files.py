@@ -42,7 +42,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
-    """Do not register files inside the context: earlier outputs that the command overwrites."""
+    """Do not register files that are read inside the context; outputs may overwrite them."""
     token = _register.set(None)
     try:
         yield

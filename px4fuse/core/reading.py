@@ -184,9 +184,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
             ]
         elif (size := file_size(path, LogError)) > limit:
-            raise LogError(
-                format_size_limit(display_name(path), size, limit), f"{LOG_SIZE_REMEDY}."
-            )
+            raise LogError(format_size_limit(display_name(path), size, limit), LOG_SIZE_REMEDY)
         else:
             files = [path]
         for file in files:

@@ -13,8 +13,8 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -58,7 +58,8 @@ class _Worker:
         environment = dict(os.environ)
         os.environ.update(_ENVIRONMENT)
         try:
-            self.process.start()
+            with _interrupts_blocked():
+                self.process.start()
         finally:
             os.environ.clear()
             os.environ.update(environment)
@@ -73,6 +74,19 @@ class _Worker:
         self.process.join()
         self.process.close()
         self.pipe.close()
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block Ctrl-C; a process that starts meanwhile inherits this, and prints no traceback."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def run_bounded(

@@ -18,6 +18,11 @@ STANDARD_OUTPUT = Path("-")
 READER_TIMEOUT_S = 5.0
 # True on Windows, on which a file cannot be replaced while another program has it open
 LOCKS_OPEN_FILES = sys.platform == "win32"
+# Action if an output cannot be written, by error number
+REMEDIES = {
+    errno.ENOSPC: "Free disk space, or choose another disk.",
+    errno.EROFS: "Choose a folder that can be written.",
+}
 # Maximum number of paths that a message lists; if there are more, it contains their number
 _MAX_LISTED = 4
 
@@ -92,6 +97,7 @@ def _file_mode(path: Path) -> int:
 
 
 def _replace(target: Path, content: bytes) -> None:
+    is_new_folder = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
     # the temporary name is short, because the target's name may have the maximum length
     temporary = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
@@ -101,6 +107,8 @@ def _replace(target: Path, content: bytes) -> None:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+        if is_new_folder and not target.exists():  # for example on a full disk
+            target.parent.rmdir()
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
@@ -122,7 +130,7 @@ def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]
     name = "standard output" if path == STANDARD_OUTPUT else path
     reason = "no program reads the pipe" if error.errno == errno.ENXIO else error.strerror
     already_written = f"; {written_before(written_files)}" if written_files else ""
-    remedy = "Choose another output name."
+    remedy = REMEDIES.get(error.errno or 0, "Choose another output name.")
     if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
         remedy = "Close the program that has the file open, or choose another output name."
     return OutputError(f"{name} cannot be written ({reason}){already_written}", remedy)

@@ -46,18 +46,9 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
-# Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
-CORRELATION_PASS_S = 8.0
 # Minimum state variance, to avoid a division by zero
 MIN_STATE_VARIANCE = 1e-30
-# Samples with |ln(NIS / gate²)| below this limit are near the gate. If the log lacks EKF2's
-# decision on such a sample, it is inferred from the published position
-MAX_LOG_RATIO = 1.0
-# Scale of the logistic distribution of the replay's error of ln(NIS / gate²)
-LOG_RATIO_SCALE = 0.04 / 1.7
-# Standard deviation (m) of a position correction that is estimated from the published position
-CORRECTION_SIGMA_M = 0.02
-# Number of events whose matrices are copied together, which limits memory
+# Number of events for which transition matrices are copied at once: more events need more memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) of a measurement without effect
 IGNORED_VARIANCE = 1e9
@@ -370,7 +361,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         x[has_bias, BIAS_DOWN] = segment.mean_bias_down_m_s2
     logged_decisions = inputs.received.rejected[sample], inputs.received.reset[sample]
     is_aid_enabled = enabled[inputs.aid.name]
-    logged_correction_m = inputs.received.correction_m if uses_logged_decisions.any() else None
     action_inputs = (
         np.where(is_aid_enabled, action, IDLE),
         event_table["can_start"] & is_aid_enabled,
@@ -378,7 +368,13 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         has_gate,
         uses_logged_decisions,
     )
-    fusion = _Fusion(inputs.rules, segment.time_s[0], *action_inputs, *logged_decisions)
+    fusion = _Fusion(
+        inputs.rules,
+        segment.time_s[0],
+        *action_inputs,
+        *logged_decisions,
+        inputs.received.has_all_resets,
+    )
     innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
     field_record = np.full(
         (0 if field_samples is None else event_count, 3, configuration_count, 3), np.nan
@@ -460,14 +456,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
             is_outside_gate = is_outside_gate[:, POSITION_COLUMNS].any(axis=1)
-            if logged_correction_m is not None:
-                is_on_edge, was_rejected = _rejection_by_output(
-                    logged_correction_m[sample[e]],
-                    *(array[:, POSITION_COLUMNS] for array in (nu, S, noise[e], gate_squared)),
-                )
-                is_outside_gate = np.where(
-                    uses_logged_decisions & is_on_edge, was_rejected, is_outside_gate
-                )
             is_rejected[e], is_fused[e], reset[e], is_velocity_fused = fusion.decide(
                 e, is_outside_gate, is_velocity_fused
             )
@@ -572,7 +560,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 
 
 def _reduce_variance_to(P: Array, row: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance after an update that reduces a state's variance to ``target``."""
+    """Return gain and covariance after an update that reduces a state's variance to a target."""
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target_variance)
     K = P[:, :, row] / (variance + R)[:, None]
@@ -598,27 +586,12 @@ def _sequential_update(
         column = columns[:, j : j + 1]
         cross_covariance = columns[:, j, rows]
         b[:, j] -= weight_squared[:, j] * cross_covariance[:, j]
-        factor = b[:, j, None] * cross_covariance[:, j + 1 :]
-        columns[:, j + 1 :] -= factor[:, :, None] * column
+        if j + 1 < nu.shape[1]:
+            factor = b[:, j, None] * cross_covariance[:, j + 1 :]
+            columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root
-
-
-def _rejection_by_output(
-    observed_correction_m: Array, nu: Array, S: Array, R: Array, gate_squared: Array
-) -> tuple[BoolArray, BoolArray]:
-    """Infer EKF2's rejection of a position sample near the gate from the published position.
-
-    A fused sample moves the published position by (1 - R/S)ν, a rejected one by 0. Return masks of
-    the configurations for which the sample is near the gate, and for which EKF2 rejected it.
-    """
-    ratio = (nu * nu / (gate_squared * S)).max(axis=1)
-    log_ratio = np.log(np.maximum(ratio, 1e-9))
-    is_near_gate = (np.abs(log_ratio) < MAX_LOG_RATIO) & np.isfinite(observed_correction_m).all()
-    correction_m = (1.0 - R / S) * nu
-    surplus_m2 = correction_m @ observed_correction_m - 0.5 * (correction_m**2).sum(axis=1)
-    return is_near_gate, surplus_m2 / CORRECTION_SIGMA_M**2 < log_ratio / LOG_RATIO_SCALE
 
 
 @dataclass
@@ -639,6 +612,7 @@ class _Fusion:
     uses_logged_decisions: BoolArray
     rejected: Array
     reset: BoolArray
+    has_all_resets: bool
 
     def __post_init__(self) -> None:
         configuration_count = len(self.has_gate)
@@ -675,16 +649,22 @@ class _Fusion:
             & has_gate
             & may_fuse
         )
+        gap_s = now_s - self.last_position_s
+        if self.has_all_resets and not is_decision_logged:
+            # without a reset in the log EKF2 fused the last sample before the time limit
+            following = min(e + 1, len(self.time_s) - 1)
+            is_last = self.time_s[following] - self.last_position_s > rules.reset_s
+            is_rejected &= ~(follows_log & is_last & ~self.reset[following])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
         is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
-        gap_s = now_s - self.last_position_s
         is_failing = is_rejected & ~self.is_stopped & (gap_s > rules.reset_s)
         if rules.resets_velocity:
             are_both_late = now_s - self.last_velocity_s > rules.reset_s
             is_failing &= are_both_late | (gap_s > 2.0 * rules.reset_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
-        if is_decision_logged or self.reset[e]:
-            is_restarted = np.where(follows_log, has_gate & self.reset[e], is_restarted)
+        if is_decision_logged or self.reset[e] or self.has_all_resets:
+            logged_restart = has_gate & (self.reset[e] | (action == START))
+            is_restarted = np.where(follows_log, logged_restart, is_restarted)
             is_fused &= ~is_restarted
             is_failing &= ~follows_log
         self.last_position_s = np.where(is_fused | is_restarted, now_s, self.last_position_s)
@@ -719,24 +699,21 @@ def _variance_growth(
     return np.repeat((density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(limit**2, 3, axis=-1)
 
 
-def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Intervals) -> ReplaySegment:
+def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
     """Estimate the correlations of the initial state of a segment; the log has variances only.
 
-    They are estimated from the flight before the segment, or else from its first seconds. Without
-    them, the first updates would divide an error wrongly between tilt and accelerometer bias.
+    Without correlations, the first updates would divide the error differently than EKF2 between
+    tilt and accelerometer bias. The correlations are estimated from the flight before the segment.
     """
-    flown_configuration = FilterConfiguration(inputs.settings)
-    inputs = replace(inputs, vision=None)
-    start = segment
+    correlation = _settled_correlation(segment)
     if (history := segment.history) is not None:
-        start = replace(history, correlation=_settled_correlation(history))
-        intervals = make_intervals(inputs, start, flown_configuration.timing(inputs))
-    else:
-        ends_s = segment.time_s[intervals.events.end_step]
-        count = int(np.searchsorted(ends_s, segment.time_s[0] + CORRELATION_PASS_S))
-        intervals = Intervals(*(values[:count] for values in vars(intervals).values()))
-    run = run_segment(inputs, start, [flown_configuration], [intervals])
-    correlation = _correlation(run.covariance[0])
+        inputs = replace(inputs, vision=None)
+        configuration = FilterConfiguration(inputs.settings)
+        history = replace(history, correlation=_settled_correlation(history))
+        intervals = make_intervals(inputs, history, configuration.timing(inputs))
+        correlation = _correlation(
+            run_segment(inputs, history, [configuration], [intervals]).covariance[0]
+        )
     if segment.field is not None:
         # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
         correlation = block_diag(
@@ -761,7 +738,7 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
     """
     to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
-    P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance) @ to_earth.T))
+    P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance[:STATE_COUNT]) @ to_earth.T))
     for tilt, bias, acceleration_per_rad in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):
         P[tilt, bias] = P[bias, tilt] = (
             min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias]) / acceleration_per_rad

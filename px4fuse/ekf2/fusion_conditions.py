@@ -184,7 +184,7 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
             "gap",
             f"no position for {duration_s:.1f} s from {last_s:.1f} s on",
             f"EKF2 stops fusion {limit_s:g} s after the last position.",
-            "Restore the line of sight and the link of the position source.",
+            "Check the position source and its data link.",
         )
 
 

@@ -15,7 +15,6 @@ from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
-from px4fuse.ekf2.output_predictor import corrections
 from px4fuse.ekf2.replay_segments import (
     IMU_GAP_S,
     MIN_SEGMENT_S,
@@ -38,6 +37,7 @@ from px4fuse.flight.ekf2_parameters import (
     fuses_by_mask,
 )
 from px4fuse.flight.model import (
+    DEAD_RECKONING,
     Columns,
     Ekf2,
     Flight,
@@ -48,6 +48,7 @@ from px4fuse.flight.model import (
     step_values_at,
 )
 from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.readers.common import flight_spans
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
@@ -68,6 +69,11 @@ ROTATE_VISION_BIT = 64
 # Maximum time difference (s) between a logged innovation and its sample: estimator_aid_src topics
 # contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
+# Tolerance (s) for rounding in comparisons of sample times with times of prediction steps
+STEP_TOLERANCE_S = 1e-4
+# Time (s) without fusion of horizontal aiding after which EKF2 reports inertial dead reckoning
+# (no_aid_timeout_max, common.h)
+DEAD_RECKONING_S = 1.0
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
 GNSS_VELOCITY_BIT = 4
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
@@ -104,9 +110,9 @@ class ReceivedPositions:
     uses_sender_times : bool
         True if EKF2 ignores its delay parameter.
     reset_s : ndarray
-        Timestamps of the samples with a new ``reset_counter``.
-    correction_m : ndarray, shape (m, 2), or None
-        Position correction by each sample, if the log lacks some rejections.
+        Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
+    has_all_resets : bool
+        True if the log contains all resets of EKF2's position to a sample.
     """
 
     stamp_s: Array
@@ -120,7 +126,7 @@ class ReceivedPositions:
     velocity_variance_m2_s2: Array | None = None
     uses_sender_times: bool = False
     reset_s: Array | tuple[()] = ()
-    correction_m: Array | None = None
+    has_all_resets: bool = False
 
 
 @dataclass(frozen=True)
@@ -253,12 +259,6 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"the log has no sample of {aid.label} while EKF2 reports its fusion",
             "Record estimator_status_flags and the position source for the whole flight.",
         )
-    position_samples = replace(
-        position_samples,
-        correction_m=_position_corrections(
-            ekf2, position_samples, effective_settings(record.parameters, aid), aid
-        ),
-    )
     vision = (
         _read_vision_besides_gnss(flight, logged_ekf2, record, attitude)
         if is_gnss and EV_POS.name not in doubtful_aids
@@ -312,9 +312,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
+        # EKF2 clips vision heights while it reports a bad acceleration; the model does not
         vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
-        and bool(ekf2.fusion_flags["vertical"].mean() > 0.5),
+        and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
+        and not any(np.any(segment.is_acceleration_bad) for segment in segments),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
         logged_height_reason=logged_height_reason,
@@ -432,44 +434,12 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         timestamp_s,
         samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
         reported_variance.to_numpy(),
-        *_logged_decisions(ekf2, record, timestamp_s, GNSS_POS),
+        *_logged_decisions(ekf2, record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
         uses_sender_times=track.age_s == 0.0 != flown_s,
     )
-
-
-def _position_corrections(
-    ekf2: Ekf2, received: ReceivedPositions, settings: Mapping[str, float], aid: Aid
-) -> Array | None:
-    """Return EKF2's position correction (m) by each sample, from the published position.
-
-    None if all rejections are logged, or none occurred.
-    """
-    innovations = ekf2.innovations["north"]
-    horizon_s = ekf2.horizon_s
-    if (
-        isinstance(innovations, Unavailable)
-        or isinstance(horizon_s, Unavailable)
-        or np.isfinite(received.rejected).all()
-        or not (innovations["rejected"] > 0.0).any()
-    ):
-        return None
-    times = ekf2.state.index.to_numpy()
-    velocity, position = (
-        ekf2.state[names[:2]].to_numpy() for names in (Columns.VELOCITY, Columns.POSITION)
-    )
-    for reset in ekf2.resets:
-        if reset.quantity == "position":
-            position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # EKF2 fuses a sample when the fusion horizon reaches its measurement time, or on late arrival
-    published_s = np.maximum(
-        received.stamp_s - settings[aid.delay] * 1e-3 + horizon_s,
-        received.arrival_s + 0.5 * ekf2.step_s,
-    )
-    before_sample_s = np.maximum.accumulate(published_s) - 1.5 * ekf2.step_s
-    return corrections(times, velocity, position, before_sample_s, settings["EKF2_TAU_POS"])
 
 
 def read_vision(
@@ -515,7 +485,7 @@ def read_vision(
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, age.index, age)
-    decisions = _logged_decisions(ekf2, record, timestamp_s)
+    decisions = _logged_decisions(ekf2, record, timestamp_s, arrival_s)
     return ReceivedPositions(
         timestamp_s,
         arrival_s,
@@ -524,6 +494,7 @@ def read_vision(
         *decisions,
         track.name,
         reset_s=reset_times_s(track),
+        has_all_resets=DEAD_RECKONING in record.states,
     )
 
 
@@ -549,7 +520,11 @@ def _read_vision_besides_gnss(
 
 
 def _logged_decisions(
-    ekf2: Ekf2, record: FusionRecord, timestamp_s: Array, aid: Aid = EV_POS
+    ekf2: Ekf2,
+    record: FusionRecord,
+    timestamp_s: Array,
+    arrival_s: Array,
+    aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
     """Return EKF2's logged rejection and reset at each position sample."""
     rejected_flags = np.full(len(timestamp_s), np.nan)
@@ -564,22 +539,49 @@ def _logged_decisions(
         return rejected_flags, reset
     delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
+    # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
+    due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
+    log = ekf2.aids[aid.name].samples
+    # EKF2 rejected all samples from the last fusion or reset to each row, and in dead reckoning
+    fusions = log.reindex(columns=["last_fused_s"]).dropna()
+    to_rows = np.column_stack([fusions, fusions.index])
+    in_reckoning = _dead_reckoning_spans(ekf2, record) if aid == EV_POS else to_rows[:0]
+    limits = np.searchsorted(due_s, np.concatenate([to_rows, in_reckoning]) + STEP_TOLERANCE_S)
+    for begin, end in limits.tolist():
+        rejected_flags[begin : max(end - 1, 0)] = 1.0
+    may_reset = np.isnan(rejected_flags)
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     logged = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = logged["rejected"]
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
-    may_reset = rejected_flags != 0.0
-    may_reset[sample_row >= 0] |= logged["innovation_m"] == 0.0
-    # a reset is published one fusion horizon after the measurement
-    publication_s = measured_s + horizon_s
+    may_reset[sample_row >= 0] &= (logged["rejected"] > 0.0) | (logged["innovation_m"] == 0.0)
+    last_fused, ends = limits[: len(to_rows), 0] - 1, limits[len(to_rows) :, 1] - 1
+    # a reset is visible in the next published state, one fusion horizon later than the measurement
+    published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
-        earlier_rows = np.flatnonzero((publication_s <= reset_s) & may_reset)
-        if (
-            len(earlier_rows)
-            and reset_s - publication_s[earlier_rows[-1]] < MAX_RESET_PUBLICATION_S
-        ):
-            reset[earlier_rows[-1]] = True
+        is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
+        rows = np.flatnonzero(is_recent & may_reset)
+        ends_here = np.intersect1d(rows, ends)
+        reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
+    is_fused = np.zeros(len(reset), bool)
+    is_fused[last_fused[last_fused >= 0]] = True
+    rejected_flags[is_fused & ~reset & np.isnan(rejected_flags)] = 0.0
     return rejected_flags, reset
+
+
+def _dead_reckoning_spans(ekf2: Ekf2, record: FusionRecord) -> Array:
+    """Return the times (s) without fusion of vision; each ends with a fusion or a reset.
+
+    EKF2 reports inertial dead reckoning after DEAD_RECKONING_S without fusion, and immediately if
+    vision is disabled.
+    """
+    steps = record.states.get(DEAD_RECKONING)
+    enabled = ekf2.states.get(EV_POS.name)
+    if steps is None or enabled is None:
+        return np.zeros((0, 2))
+    spans = np.array(flight_spans(steps == 0.0, np.inf)).reshape(-1, 2)
+    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(enabled, spans[:, 0]) > 0.0)
+    return spans
 
 
 def aid_source(aid: Aid) -> str:

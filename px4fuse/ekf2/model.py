@@ -139,11 +139,9 @@ def _open_without_aids(
     flown_configuration = FilterConfiguration(inputs.settings)
     timing = flown_configuration.timing(inputs)
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
-    segments = (
-        with_correlation(inputs, *pair) for pair in zip(inputs.segments, intervals, strict=True)
-    )
-    inputs = replace(inputs, segments=tuple(segments))
-    configurations = [flown_configuration, replace(flown_configuration, uses_logged_decisions=True)]
+    segments = tuple(with_correlation(inputs, segment) for segment in inputs.segments)
+    inputs = replace(inputs, segments=segments)
+    configurations = [flown_configuration]
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
@@ -152,20 +150,13 @@ def _open_without_aids(
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
+    model = Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    received = inputs.received
-    has_all_decisions = received.correction_m is not None
-    if rejected_share > MANY_REJECTIONS_FRACTION and (
-        has_all_decisions or np.isfinite(received.rejected).any()
-    ):
-        agreement_with_decisions = agreement_with_log(
-            flight, _make_replay(inputs, runs, configurations[1], {})
-        )
-        if isinstance(agreement_with_decisions, Agreement):
-            agreement = with_logged_rejections(
-                agreement, agreement_with_decisions, has_all_decisions=has_all_decisions
-            )
-    # report the bad agreement of omitted sources
+    if rejected_share > MANY_REJECTIONS_FRACTION and np.isfinite(inputs.received.rejected).any():
+        with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
+        if isinstance(with_decisions, Agreement):
+            agreement = with_logged_rejections(agreement, with_decisions)
+    # the agreement of an omitted aiding source is from the replay that contained this source
     failed_fields = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
         for name, failed_agreement in failed_agreements.items()
@@ -173,8 +164,7 @@ def _open_without_aids(
     agreement = structs.replace(
         agreement, doubtful={**doubtful_aids, **agreement.doubtful}, **failed_fields
     )
-    replay = structs.replace(replay, agreement=agreement)
-    return Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
+    return replace(model, flown=structs.replace(replay, agreement=agreement), agreement=agreement)
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
@@ -248,7 +238,7 @@ def replay_settings(
         inputs = replace(
             inputs,
             received=replace(
-                inputs.received, rejected=rejected_flags, reset=no_reset, correction_m=None
+                inputs.received, rejected=rejected_flags, reset=no_reset, has_all_resets=False
             ),
         )
         model = replace(model, inputs=inputs, runs=())

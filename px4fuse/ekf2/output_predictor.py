@@ -8,13 +8,10 @@ computed as a recursive (IIR) filter.
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csr_array, eye_array
-from scipy.sparse.linalg import spsolve
 
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay_segments import (
@@ -28,15 +25,7 @@ from px4fuse.trajectory.rotation import rotate
 
 # Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Time after which the effect of a position correction is neglected, in time constants τ
-MAX_TIME_CONSTANTS = 5.0
-# Weight of the prior "correction 0", which separates corrections between two logged positions
-PRIOR_WEIGHT = 1e-3
-# Positions are missing in an interval longer than this multiple of the median
-MAX_ROW_INTERVALS = 3.0
-# A correction is estimated only if the logged positions show this fraction of it
-MIN_VISIBLE_FRACTION = 0.5
-# Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
+# Gain of the correction of the published attitude per fusion horizon delay (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 
@@ -105,66 +94,8 @@ def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -
     return np.asarray(correction_sum + offset[0])
 
 
-def corrections(
-    time_s: Array, velocity_m_s: Array, position_m: Array, sample_s: Array, tau_s: float
-) -> Array:
-    """Estimate EKF2's position correction by each sample from the published position.
-
-    A correction appears in the published position as correction · (1 - exp(-t / τ)). All
-    corrections are estimated together by least squares.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Times of the published positions.
-    velocity_m_s, position_m : ndarray, shape (n, a)
-    sample_s : ndarray, shape (m,)
-        Start of each correction, increasing.
-    tau_s : float
-        EKF2_TAU_POS.
-
-    Returns
-    -------
-    ndarray, shape (m, a)
-        Corrections (m); NaN where logged positions are missing.
-    """
-    interval_s = np.diff(time_s)
-    dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
-    correction_increments = np.diff(position_m, axis=0) - dead_reckoned
-    usual_s = float(np.median(interval_s))
-    is_usable = np.isfinite(correction_increments).all(axis=1) & (
-        interval_s < MAX_ROW_INTERVALS * usual_s
-    )
-    correction_increments[~is_usable] = 0.0
-    row_count = math.ceil(MAX_TIME_CONSTANTS * tau_s / usual_s) + 1
-    row = np.searchsorted(time_s, sample_s, side="right") - 1 + np.arange(row_count)[:, None]
-    is_inside = (
-        (row >= 0)
-        & (row < len(correction_increments))
-        & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
-    )
-    row = row[is_inside]
-    sample_index = np.nonzero(is_inside)[1]
-    decay_start, decay_end = (
-        np.exp(-np.maximum(time_s[step] - sample_s[sample_index], 0.0) / tau_s)
-        for step in (row, row + 1)
-    )
-    visible_fractions = csr_array(
-        (decay_start - decay_end, (row, sample_index)),
-        shape=(len(correction_increments), len(sample_s)),
-    )
-    normal_matrix = visible_fractions.T @ visible_fractions + PRIOR_WEIGHT * eye_array(
-        len(sample_s)
-    )
-    result = np.reshape(
-        spsolve(normal_matrix.tocsc(), visible_fractions.T @ correction_increments),
-        (len(sample_s), -1),
-    )
-    return np.where(visible_fractions.sum(axis=0)[:, None] > MIN_VISIBLE_FRACTION, result, np.nan)
-
-
 def delay_by(values: Array, lag_steps: int) -> Array:
-    """Delay values by ``lag`` steps; the first value is repeated."""
+    """Delay values by ``lag_steps``; the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 

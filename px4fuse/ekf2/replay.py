@@ -84,8 +84,10 @@ MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # sample near the gate changes many later ones. Single innovations are then compared in a replay
 # with the logged rejections
 MANY_REJECTIONS_FRACTION = 0.05
-# With a larger rejected fraction, unknown resets explain a bad agreement
+# Rejected fraction above which EKF2's position is mostly integrated from the IMU: the published
+# position is then not tested, but the innovations must agree better
 MOSTLY_REJECTED_FRACTION = 0.5
+MIN_IMU_CORRELATION = 0.99
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
@@ -560,26 +562,31 @@ def _format_beyond(value: float, limit: float) -> str:
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def with_logged_rejections(
-    agreement: Agreement, logged_rejections_agreement: Agreement, *, has_all_decisions: bool
-) -> Agreement:
-    """Return the agreement, with the verdict from a replay with logged rejections.
+def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> Agreement:
+    """Return the agreement of a replay with EKF2's logged decisions.
 
-    With many rejections, one sample near the gate makes a correct replay differ from the log. If
-    every decision is logged, all numbers are from the replay with logged rejections.
+    With many rejections, one sample near the gate makes a correct replay differ from the log.
+    ``agreement`` is of the replay with the gate of the model.
     """
-    is_good, reason = _agreement_verdict(
-        logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
-    )
-    reason = f"in a replay with EKF2's logged rejections, {reason}"
-    if not is_good and agreement.rejected_fraction_logged > MOSTLY_REJECTED_FRACTION:
+    rejected = agreement.rejected_fraction_logged
+    relies_on_imu = rejected > MOSTLY_REJECTED_FRACTION
+    published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
+    is_good, reason = _agreement_verdict(with_decisions.axes, 0.0, 0.0, published_factor)
+    correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
+    if is_good and relies_on_imu and correlation < MIN_IMU_CORRELATION:
+        is_good = False
         reason = (
-            f"EKF2 rejected {agreement.rejected_fraction_logged:.0%} of the positions and reset "
-            "its position every second, to samples that the log does not show. The frame of the "
-            "source is probably wrong"
+            f"the correlation {correlation:.4f} of replayed and logged innovations is below the "
+            f"minimum of {MIN_IMU_CORRELATION:g}"
+        )
+    reason = f"in a replay with EKF2's logged rejections, {reason}"
+    if relies_on_imu and not is_good:
+        reason += (
+            f". EKF2 rejected {rejected:.0%} of the positions and relied on the IMU. The frame of "
+            "the source is probably wrong"
         )
     return replace(
-        logged_rejections_agreement if has_all_decisions else agreement,
+        with_decisions,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,

@@ -328,18 +328,15 @@ def find_replay_segments(
             continue
         segment_inputs = imu, attitude, ekf2, record
         changed = {change.name: change.after for change in changes if change.time_s <= low}
-        if not is_gnss:
-            segment = _make_segment(*segment_inputs, start_row, high)
-            segments.append(replace(segment, changed=changed))
-            continue
-        segment = _make_gnss_segment(*segment_inputs, start_row, high)
+        make_segment = _make_gnss_segment if is_gnss else _make_segment
+        segment = make_segment(*segment_inputs, start_row, high)
         history_row = int(
             np.searchsorted(
                 state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
             )
         )
         if history_row < start_row:
-            history = _make_gnss_segment(*segment_inputs, history_row, state_times_s[start_row])
+            history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
         if field_span and field_span[0] <= state_times_s[start_row] and high <= field_span[1]:
             segment = _add_field(segment, record, start_row, ekf2.step_s)
@@ -370,11 +367,6 @@ def _make_gnss_segment(
         ekf2_metres_per_metre=metres_per_metre,
         correction_rad=segment.correction_rad + earth_rotation_rad,
         clipped_fraction=_clipped_fraction(imu, segment.time_s),
-        is_acceleration_bad=(
-            record.was_in_state(BAD_ACCELERATION, segment.time_s)
-            if BAD_ACCELERATION in record.states
-            else None
-        ),
         mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
     )
 
@@ -476,6 +468,11 @@ def _make_segment(
             [np.interp(times, states, component) for component in error.T]
         ),
         correlation=np.eye(15),
+        is_acceleration_bad=(
+            record.was_in_state(BAD_ACCELERATION, times)
+            if BAD_ACCELERATION in record.states
+            else None
+        ),
     )
 
 

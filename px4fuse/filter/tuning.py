@@ -183,7 +183,11 @@ def tune(
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+            try:
+                tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+            except np.linalg.LinAlgError as error:  # positions far outside of the track
+                what = f"estimate of the noises ({name})"
+                tunings[name] = Unavailable(what, str(error), "Remove positions far from the path.")
     return tunings
 
 

@@ -33,9 +33,10 @@ GROUND = "never took off"
 # Key in Finding.evidence: wrong axes, unit, clock or orientation of the source
 CONVENTION = "convention"
 # Findings that make all estimates invalid, so they are listed first
-WRONG_IMU = ("gyroscope_bias", "ekf2_bias_at_limit")
 UNUSABLE = (
-    *WRONG_IMU,
+    "imu_values_impossible",
+    "gyroscope_bias",
+    "ekf2_bias_at_limit",
     "source_is_ekf2_estimate",
     "source_two_senders",
     "source_positions_rounded",
@@ -48,8 +49,10 @@ UNUSABLE = (
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
-# Findings to be corrected first: their action is printed instead of the actions of their effects
+# Causes that explain other findings only if they are no notes
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
+# Effects whose action corrects their cause, too, so that either action is enough
+ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
 NOISES = frozenset(
@@ -108,14 +111,27 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         ]
         groups = [group for group in groups if group not in effect_groups]
         for effect, *further_effects in effect_groups:
-            remedy = cause_group[0].remedy if cause in CORRECTED_FIRST else effect.remedy
-            cause_group += [replace(effect, caused_by=cause, remedy=remedy), *further_effects]
+            cause_group += [replace(effect, caused_by=cause), *further_effects]
         severities = (
             effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES
         )
         severity = min((cause_group[0].severity, *severities), key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
-    return tuple(finding for group in sorted(groups, key=_report_rank) for finding in group)
+    return tuple(
+        _with_action_of(group[0], finding)
+        for group in sorted(groups, key=_report_rank)
+        for finding in group
+    )
+
+
+def _with_action_of(cause: Finding, finding: Finding) -> Finding:
+    """Replace the action of an effect, which would hide its cause, by the action of the cause.
+
+    For example a larger measurement noise hides outliers.
+    """
+    if finding.caused_by is None or cause.severity == "note" or finding.id in ALTERNATIVE_FIXES:
+        return finding
+    return replace(finding, remedy=cause.remedy)
 
 
 def effect_ids(cause: str) -> tuple[str, ...]:

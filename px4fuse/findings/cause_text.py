@@ -18,7 +18,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_UNITS
 from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import format_percent
+from px4fuse.findings.model import format_percent, source_words
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
@@ -77,10 +77,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS, None):
-        actions.append(
-            f"{'Give the antenna a free view of the sky' if is_gnss else 'Restore line of sight'}, "
-            "or remove the outliers before sending."
-        )
+        actions.append(source_words(analysis.source).outliers_action)
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)

@@ -21,9 +21,8 @@ MIN_NAMED_REJECTION = 0.05
 
 def detect(analysis: Analysis) -> Findings:
     """Detect a wrong measurement noise of EKF2: a replay with the estimate is consistent."""
-    aid = aid_of(analysis)
-    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid.noise)
-    if trial is None or not _corrects_innovations(trial):
+    trial, aid = confirmed_noise_trial(analysis), aid_of(analysis)
+    if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
@@ -60,10 +59,13 @@ def detect(analysis: Analysis) -> Findings:
     )
 
 
-def _corrects_innovations(trial: Trial) -> bool:
-    return any(
+def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
+    """Return the re-run with another EKF2 noise, if its innovations become consistent."""
+    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
+    is_confirmed = trial is not None and any(
         classify_ratio(before, against) != "consistent"
         and classify_ratio(after, against) == "consistent"
         for against, before, after in ratio_pairs(trial)
         if against == "source"
     )
+    return trial if is_confirmed else None

@@ -8,8 +8,13 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import Trial, improvement, preference
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
-from px4fuse.findings.model import Findings, finding, format_percent, zero_length_spans
-from px4fuse.flight.ekf2_parameters import GNSS_POS
+from px4fuse.findings.model import (
+    Findings,
+    finding,
+    format_percent,
+    source_words,
+    zero_length_spans,
+)
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
@@ -81,8 +86,8 @@ def _remedy(analysis: Analysis, result: AxisComparison) -> str:
     if trials and result is analysis.main:
         return format_action(analysis, min(trials, key=preference).change)
     return (
-        f"Check {'reception' if aid == GNSS_POS else 'line of sight'}, {aid.delay} and {aid.noise} "
-        f"first. Increase {aid.gate} last."
+        f"Check {source_words(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
+        f"Increase {aid.gate} last."
     )
 
 

@@ -9,7 +9,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, format_percent, fraction_on, spans_with_value
-from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
 from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable
 
 # Parameter with the limit of a bias state, its unit, sensor, and columns of the bias
@@ -92,8 +92,8 @@ def _detect_limited_bias(
             if abs(force_m_s2 - GRAVITY_M_S2) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {GRAVITY_M_S2:.2f}: the bias is "
-                    f"{GRAVITY_M_S2 - force_m_s2:+.2f} m/s² down."
+                    f"instead of {GRAVITY_M_S2:.2f}: the bias is {GRAVITY_M_S2 - force_m_s2:+.2f} "
+                    "m/s² down."
                 )
         yield error(
             "ekf2_bias_at_limit",
@@ -141,14 +141,17 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
         isinstance(fusing, pd.DataFrame) and fraction_on(fusing["yaw"], segment) > 0.0
     )
     has_yaw = analysis.source.orientation is not None
+    mag_type = analysis.flight.log.parameters.get(MAG.switch)
+    magnetometer = "Calibrate the magnetometer"
+    if mag_type == NO_MAGNETOMETER:
+        magnetometer = f"Enable the magnetometer ({MAG.switch} 0)"
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
         (
             "yaw_align",
             "heading",
-            "Calibrate and enable the magnetometer, or "
-            f"{'' if has_yaw else 'send the orientation of the source and '}let EKF2 fuse the yaw "
-            "of the source.",
+            f"{magnetometer}, or {'' if has_yaw else 'send the orientation of the source and '}"
+            "let EKF2 fuse the yaw of the source.",
         ),
     ):
         steps = ekf2.states.get(flag)

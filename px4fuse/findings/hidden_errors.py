@@ -26,7 +26,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
 from px4fuse.findings.cause_text import format_action, is_refuted, kind_of_cause
-from px4fuse.findings.model import Findings, error, finding, format_percent, note
+from px4fuse.findings.model import Findings, error, finding, format_percent, note, source_words
 from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
@@ -49,14 +49,6 @@ EKF2_REMEDY = (
 HEIGHT_REMEDY = (
     "Check the height sensors that EKF2 fuses (EKF2_HGT_REF) and the accelerometer: KF has a "
     "smaller height error."
-)
-SHARED_REMEDY = (
-    "Check the time offset (px4fuse sync LOG). Then check multipath, the anchor survey and "
-    "smoothing in the positioning system."
-)
-GNSS_REMEDY = (
-    "Check the delay of the GNSS positions (px4fuse sync LOG). Then check reception, EKF2's "
-    "heading and the lever arm of the antenna."
 )
 
 
@@ -140,7 +132,7 @@ def make_error_finding(
         }
     is_misaligned = aligned is not None and aligned.is_misaligned
     if analysis.source.origin.may_drift and not causes and not is_misaligned:
-        return _drift_finding(analysis, aligned, worst, evidence)
+        return _drift_finding(analysis, aligned, worst, evidence, tuple(ratios))
     if is_misaligned and aligned is not None:
         sentences.append(f"The position frame is misaligned: horizontal position RMSE {aligned}.")
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
@@ -149,7 +141,10 @@ def make_error_finding(
         and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden_errors)
-    remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
+    remedy = (
+        "Check the time offset of the positions (px4fuse sync LOG). "
+        f"Then check {source_words(analysis.source).errors}."
+    )
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
@@ -172,7 +167,9 @@ def _drift_finding(
     aligned: AlignedError | None,
     worst: ErrorAboveSigma,
     evidence: Mapping[str, float | str],
+    filter_labels: tuple[str, ...],
 ) -> Finding:
+    """Make the finding of a drift that the innovations of ``filter_labels`` do not show."""
     sensor, loop = source_name(analysis.source), analysis.loop
     size = f"position RMSE {format_metres(worst.rmse_m)} m against ground truth"
     sentence = ""
@@ -193,8 +190,8 @@ def _drift_finding(
     noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {size}. {sentence}KF and EKF2 follow {sensor}, so innovations are "
-        f"small and position errors are large. Do not reduce {noises}.",
+        f"{sensor} drifts: {size}. {sentence}The innovations of {' and '.join(filter_labels)} do "
+        f"not show the drift, because the filter follows {sensor}. Do not reduce {noises}.",
         DRIFT_REMEDY,
         evidence,
     )

@@ -13,6 +13,10 @@ from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
+# Maximum specific force (m/s²) of real sensors, 35 g: the largest range is 32 g
+MAX_FORCE_M_S2 = 343.0
+# Minimum number of samples with impossible values for a finding
+MIN_IMPOSSIBLE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity error: its position error is 0.15 m after 1 s
 BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
@@ -34,12 +38,34 @@ RATE_MARGIN = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
+    yield from detect_impossible_acceleration(analysis)
     yield from detect_tumbling(analysis)
     yield from detect_bias(analysis)
     yield from detect_clipping(analysis)
     yield from detect_missing_imu_samples(analysis)
     yield from detect_imu_gaps(analysis)
     yield from detect_low_rates(analysis.flight)
+
+
+def detect_impossible_acceleration(analysis: Analysis) -> Findings:
+    """Detect accelerations beyond the range of any accelerometer of an autopilot."""
+    imu = analysis.flight.imu
+    if not isinstance(imu, pd.DataFrame):
+        return
+    samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
+    force_m_s2 = np.linalg.norm(samples.to_numpy(), axis=1)
+    time_s = samples.index[force_m_s2 > MAX_FORCE_M_S2].to_numpy()
+    if len(time_s) < MIN_IMPOSSIBLE_SAMPLES:
+        return
+    yield error(
+        "imu_values_impossible",
+        f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
+        f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
+        "simulator has diverged, or the log is damaged. px4fuse estimates nothing from this time.",
+        f"Analyse only the time before (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
+        {"max_m_s2": float(np.nanmax(force_m_s2)), "count": len(time_s), "at_s": float(time_s[0])},
+        ((float(time_s[0]), float(time_s[-1])),),
+    )
 
 
 def detect_bias(analysis: Analysis) -> Findings:

@@ -12,6 +12,8 @@ from px4fuse.core.record import Record, Span, table
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
+from px4fuse.flight.model import PositionTrack
+from px4fuse.flight.position_source import PositionKind
 
 
 class CatalogueEntry(Record, frozen=True):
@@ -56,6 +58,30 @@ def load_examples() -> Mapping[str, Example]:
     )
 
 
+class SourceWords(Record, frozen=True):
+    """Causes and actions of findings about the position source, for one kind of source."""
+
+    smoothing_action: str
+    jump: str
+    jump_action: str
+    outliers: str
+    outliers_action: str
+    reception: str
+    scale: str
+    errors: str
+
+
+_WORDS = table(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
+    kind: SourceWords(**(_WORDS["unknown"] | words)) for kind, words in _WORDS.items()
+}
+
+
+def source_words(source: PositionTrack) -> SourceWords:
+    """Return the words of findings about a position source, which fit its kind of sensor."""
+    return SOURCE_WORDS[source.origin.kind]
+
+
 Findings = Iterator[Finding]
 
 
@@ -68,7 +94,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
-    if message[1:2] != " ":  # "x and y are exchanged" names axes
+    if message[1:2] != " ":  # "x and y are exchanged" begins with an axis
         message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)

@@ -396,14 +396,20 @@ def _remedy_without_replay(
     if ratio > NOISE_RATIO_TOLERANCE:
         parameters = analysis.flight.log.parameters
         is_reported = ekf2_m > MIN_REPORTED_RATIO * parameters.get(aid.noise, np.inf)
-        changes = noise_change(aid, parameters, ekf2_m * is_reported, noise_m)
+        changes = {
+            name: value
+            for name, value in noise_change(aid, parameters, ekf2_m * is_reported, noise_m).items()
+            if value != parameters.get(name)
+        }
+        if not changes:
+            return NOT_EXPLAINED
         return (
             f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay confirms this "
             "change: fly again and compare."
         )
     return (
-        f"EKF2's measurement noise ({ekf2_m:.2g} m) is right: check {aid.delay} and "
-        "EKF2_ACC_NOISE instead."
+        f"EKF2's measurement noise ({ekf2_m:.2g} m) fits the position noise, so another error "
+        "makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
     )
 
 

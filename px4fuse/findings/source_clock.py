@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
@@ -144,13 +144,10 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     model = analysis.ekf2_model
     if isinstance(model, Unavailable) or not model.agreement.good:
         return
-    estimate = remedy.estimate_gnss_delay_ms(model)
+    estimate = remedy.wrong_gnss_delay_ms(model)
     if estimate is None:
         return
     delay_ms, (ml_delay_ms, sigma_ms) = model.inputs.settings[GNSS_POS.delay], estimate
-    limit_ms = max(1e3 * MIN_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
-    if abs(ml_delay_ms - delay_ms) <= limit_ms or ml_delay_ms < 0.0:
-        return
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "

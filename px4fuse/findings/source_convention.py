@@ -20,11 +20,10 @@ from px4fuse.convention.texts import (
     format_axes,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE, WRONG_IMU
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
-CORRECT_FIRST = "Correct the {} first."
 # Findings that are withdrawn if the source has a wrong convention
 FALSE_AFTER = (
     "ekf2_noise_too_small",
@@ -37,7 +36,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Findings that remain true if the source has a wrong convention; their action is CORRECT_FIRST
+# Findings that remain true if the source has a wrong convention, as effects of it
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -84,10 +83,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             for item in findings
             if item in unusable
             or item.id in EFFECTS
-            or (
-                CATALOGUE[item.id].group in UNAFFECTED_GROUPS
-                and (item.id != "accelerometer_bias" or unusable[0].id not in WRONG_IMU)
-            )
+            or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         root_findings = []
@@ -102,9 +98,8 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             *root_findings,
             *(item for item in others if item.id in EFFECTS or item.severity == "note"),
         ]
-    action = CORRECT_FIRST.format("IMU" if root_findings[0].id in WRONG_IMU else "position source")
     effects = [
-        replace(item, message=f"{item.title}.", remedy=action, caused_by=root_findings[0].id)
+        replace(item, message=f"{item.title}.", caused_by=root_findings[0].id)
         for item in others
         if item.id in EFFECTS and item.caused_by is None
     ]

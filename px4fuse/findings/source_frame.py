@@ -5,11 +5,13 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
+from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_of, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
@@ -20,14 +22,14 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of the heading drift against ground truth to that against the positions, for a drift
-# of EKF2's heading
+# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions; if
+# the ratio is smaller, the heading of the positions drifts
 MIN_TRUE_DRIFT_FRACTION = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
-# EKF2_MAG_TYPE without magnetometer
-NO_MAGNETOMETER = 5
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
+# Bit of EKF2_EV_CTRL that fuses the yaw of the source
+YAW_CONTROL = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
@@ -59,13 +61,15 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
         detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
+    has_yaw = analysis.source.orientation is not None
     if detail:
         return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
         f"{fault} EKF2 did not fuse the yaw of {name}. The IMU is rotated into NED, so the axes of "
         "positions and IMU may differ.",
-        "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
+        "Send the position in NED"
+        + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
     )
 
 
@@ -88,7 +92,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
-        action = f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
+        _, action = _gnss_heading_fault(analysis)
     elif analysis.source.name == IN_EKF2_FRAME:
         reason = "EKF2 fused the positions in this frame. The IMU measures another direction."
         action = "Align the positioning frame with north."
@@ -111,6 +115,15 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action,
         {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
+
+
+def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
+    """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
+    if (trial := confirmed_noise_trial(analysis)) is not None:
+        cause = f"the wrong {aid_of(analysis).noise}, which weights GNSS against the magnetometer"
+        return cause, f"Set {format_settings(trial.change)}, then check the heading again."
+    cause = "a magnetometer near currents or steel"
+    return cause, f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
 
 
 def _calibrate(analysis: Analysis) -> str:
@@ -146,14 +159,21 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     basis = "positions and IMU"
     if heading.by == "orientation":
         basis = f"the orientation of {source_name(analysis.source)}"
-    possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = "Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+    calibrate, has_yaw = _calibrate(analysis), analysis.source.orientation is not None
+    causes = [
+        "a magnetometer indoors" if calibrate else "a gyroscope bias",
+        *(["odometry whose heading drifts"] if has_yaw else []),
+    ]
+    possible_cause, action = ", or ".join(causes), ""
+    is_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL
+    let = "Or let" if calibrate else "Let"
+    if has_yaw and not is_fused:
+        action = f"{let} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
-        possible_cause, action = "a magnetometer near currents or steel", CHECK_GNSS_DELAY
-    elif analysis.source.orientation is None:
-        action = ""  # the source has no yaw that EKF2 could fuse
-    elif not analysis.flight.log.has_ulog:
-        action = "Or let the autopilot fuse the yaw of the source."
+        calibrate = ""
+        possible_cause, action = _gnss_heading_fault(analysis)
+    elif action and not analysis.flight.log.has_ulog:
+        action = f"{let} the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
@@ -163,7 +183,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
         f"{possible_cause}.",
-        f"{_calibrate(analysis)} {action}".strip() or "Check the heading source of EKF2.",
+        f"{calibrate} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,

@@ -1,7 +1,5 @@
 """Findings about gaps in the position source, lost positions, and a downsampled source."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import pandas as pd
 
@@ -16,10 +14,10 @@ from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.model import Findings, finding, format_percent, note, warning
+from px4fuse.findings.model import Findings, finding, format_percent, note, source_words, warning
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import Ekf2, Unavailable, positions_of, step_values_at
-from px4fuse.flight.position_source import ALIGNED, PositionKind
+from px4fuse.flight.position_source import ALIGNED
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
@@ -41,16 +39,8 @@ MAX_DIVISOR = 4
 # Minimum time (s) without positions at the start or end of the flight for a finding: the land
 # detector is seconds late
 MIN_PARTIAL_S = 3.0
-# Time (s) from the evaluation of KF to the next position
+# KF is evaluated this time (s) before a position, which is before its update
 SMALLEST_TIME_S = 1e-6
-# Items to check after a gap in the position source, by kind of source
-CHECKS: Mapping[PositionKind, str] = {
-    "uwb": "the data link and the line of sight to the anchors",
-    "vio": "the data link, and light and texture in view of the camera",
-    "mocap": "the data link, and the markers in view of the cameras",
-    "gnss": "the antenna's view of the sky, its cable and radio interference",
-    "file": "the recording of the positions",
-}
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -92,7 +82,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{longest}. "
             f"{state_errors_after(analysis, (start_s, end_s))}",
-            f"Check {CHECKS[source.origin.kind]} at {start_s:.1f} s.",
+            f"Check {source_words(source).reception} at {start_s:.1f} s.",
             {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(spans),
         )
@@ -107,7 +97,8 @@ def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+    sd_card = "Use a faster SD card, or log" if analysis.flight.log.dropouts else "Log"
+    return f"{sd_card} fewer topics (SDLOG_PROFILE)."
 
 
 def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
@@ -133,7 +124,7 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
         "source_stops" if stops else "source_begins",
         f"{positions_of(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
         f"{aiding}KF, RMSE and verdicts do not include this time.",
-        f"Check {CHECKS[source.origin.kind]} {before_or_after} {at_s:.1f} s.{action}",
+        f"Check {source_words(source).reception} {before_or_after} {at_s:.1f} s.{action}",
         {"at_s": at_s, "duration_s": duration_s, **at_end},
         (span_s,),
     )

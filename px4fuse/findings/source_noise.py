@@ -14,7 +14,7 @@ from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Findings, error, format_percent, note, warning
+from px4fuse.findings.model import Findings, error, format_percent, note, source_words, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
@@ -67,9 +67,6 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     ratio = noise.white_m / float(np.nanmin(assumed_m))
     if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_FRACTION * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
-    action = "Check multipath, anchor geometry and smoothing in the positioning system."
-    if is_gnss:
-        action = "Use RTK, or give the antenna a free view of the sky."
     # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
     make_finding = note if is_gnss and not _exceeds_sigma(analysis) else warning
     yield make_finding(
@@ -78,7 +75,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
         "KF and EKF2 assume independent errors: they follow the correlated error and report a σ "
         "that is too small. Innovations do not show this error.",
-        action,
+        f"Check {source_words(analysis.source).errors}.",
         evidence,
     )
 
@@ -140,7 +137,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         f"{source_name(analysis.source)} noise is {larger_m:.2g} m along "
         f"{noisy_axis} and {smaller_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
         "measurement noise, does not fit both axes.",
-        "Place the anchors on all sides of the flight area. Analyse each axis separately "
+        f"Check {source_words(analysis.source).errors}. Analyse each axis separately "
         f"(--axis {noisy_axis} --sigma-z {larger_m:.2g}).",
         {f"{quiet_axis}_sigma_z_m": smaller_m, f"{noisy_axis}_sigma_z_m": larger_m},
     )
@@ -156,16 +153,13 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     ):
         return
     ratio, start, end = noisy_part.ratio, noisy_part.start_s, noisy_part.end_s
-    items_to_check = "anchors in view, distance and obstacles"
-    if analysis.source.origin.is_gnss:
-        items_to_check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {ratio:.1f} times larger from "
         f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
         "No single SIGMA_Z fits the whole flight.",
-        f"Check {items_to_check} in that time. Let the source send a variance with each position, "
-        "or analyse this time separately (--start, --end).",
+        f"Check {source_words(analysis.source).reception} in that time. Let the source send a "
+        "variance with each position, or analyse this time separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

@@ -1,7 +1,7 @@
 """Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,7 @@ from px4fuse.findings.model import (
     finding,
     format_count,
     format_percent,
+    source_words,
     warning,
     zero_length_spans,
 )
@@ -37,15 +38,13 @@ from px4fuse.flight.model import (
     positions_of,
     reset_times_s,
     source_name,
+    white_noise_m,
 )
-from px4fuse.flight.position_source import PositionKind
 
 # Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
 MIN_MOTION_RANGE_M = 0.5
 # The 5th to 95th percentile of white noise spans 3.29 σ; the margin is 25 %
 NOISE_RANGE_FACTOR = 1.25 * 3.29
-# Ratio of the median absolute second difference to the σ of white noise
-SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
 # Minimum gain of the log likelihood by a low pass over white noise: 0 to 2 without a low pass
 MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum gain of the log likelihood by a low pass over time-correlated noise without lag
@@ -58,16 +57,34 @@ MIN_LAG_ERROR_S = 0.10
 MIN_JUMP_M = 0.2
 # Minimum jump in σ of the time-correlated noise
 MIN_JUMP_SIGMAS = 5.0
-# Minimum number of jumps with an increment of reset_counter, for a source that relocalises
-MIN_RELOCALISATIONS = 2
+# Minimum number of jumps of a source that jumps repeatedly, with a change of reset_counter
+MIN_ANNOUNCED_JUMPS = 2
+# Minimum number of jumps of a source that jumps repeatedly, without a change of reset_counter
+MIN_UNANNOUNCED_JUMPS = 3
+# Minimum size (m) of one of many jumps without a change of reset_counter
+MIN_SMALL_JUMP_M = 0.1
+# Minimum size of such a jump in medians of the differences of successive steps
+MIN_STEP_RATIO = 8.0
+# Number of differences for the median
+NOISE_SAMPLES = 61
+# Minimum number of steps between positions to find jumps
+MIN_JUMP_ROWS = 100
+# Minimum time (s) and minimum number of positions for which a jump lasts: outliers are shorter
+MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
+# Maximum difference between the jump and the shift of the median position, as fraction of the jump
+MAX_LASTING_RATIO = 0.5
+# Maximum interval at a jump in median intervals: during a gap the vehicle moves
+MAX_INTERVAL_RATIO = 1.5
+# Minimum fraction of jumps opposite to the previous one, for positions that alternate
+MIN_RETURNS = 0.7
 # Maximum time (s) from a jump to the reset of EKF2 that it causes
 MAX_WAIT_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Times within this tolerance (s) are equal: timestamps have a resolution of 1 µs
 RESET_TOLERANCE_S = 1e-4
-# Value of EKF2_EV_CTRL for a source that measures the height only
-HEIGHT_ONLY_CONTROL = 2
+# Bits of EKF2_EV_CTRL: horizontal position, and height
+HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_RESET_DISTANCE_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
@@ -90,46 +107,6 @@ MIN_INNOVATION_FRACTION = 0.75
 MIN_VARIANCE_RATIO = 2.0
 # Minimum factor between reported and estimated position variance for severity error
 MIN_VARIANCE_RATIO_ERROR = 3.0
-# Possible causes of a position jump, and action, by kind of source
-JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
-    "uwb": (
-        "a change of the anchors or of the origin",
-        "Do not change origin or anchors in flight.",
-    ),
-    "vio": (
-        "a false map match, or relocalisation in the map",
-        "Do not change map or origin in flight.",
-    ),
-    "mocap": (
-        "swapped markers, or a change of the origin",
-        "Do not change origin or rigid body in flight.",
-    ),
-    "gnss": (
-        "a change of satellites or RTK status, or multipath",
-        "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered.",
-    ),
-    "file": ("a false map match, or a change of the origin", "Use one origin for the whole file."),
-}
-# Possible cause of outliers, and action, by kind of source
-OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
-    "uwb": (
-        "reflections without line of sight (NLOS)",
-        "Give the tag line of sight to the anchors, or remove outliers before sending.",
-    ),
-    "vio": (
-        "lost visual tracking",
-        "Check light and texture in view of the camera, or remove outliers before sending.",
-    ),
-    "mocap": (
-        "hidden or swapped markers",
-        "Check the markers in view of the cameras, or remove outliers before sending.",
-    ),
-    "gnss": (
-        "multipath, or a change of the GNSS solution (fix type)",
-        "Keep the antenna in free view of the sky, away from walls and interference.",
-    ),
-    "file": ("lost or ambiguous tracking", "Remove the outliers from the file."),
-}
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -137,7 +114,7 @@ def detect(analysis: Analysis) -> Findings:
         yield make_height_only_finding(analysis)
         return
     yield from detect_little_motion(analysis)
-    yield from detect_relocalisation(analysis)
+    yield from detect_repeated_jumps(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
@@ -158,7 +135,10 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    correlation = analysis.time_correlated_noise
+    clock, correlation = analysis.clock, analysis.time_correlated_noise
+    # with fast samples the correlation determines the lag badly, the time offset shows it directly
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > -clock.interval_s[0] >= MIN_LAG_S:
+        low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # a low pass delays positions: correlated errors without a lag have another cause
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
         return None
@@ -179,8 +159,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
             f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
             f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
             "independent errors, so both are overconfident and lag.",
-            "Switch off smoothing in the positioning system and send raw positions. Leave the "
-            "timestamps as they are.",
+            f"{source_words(analysis.source).smoothing_action} Leave the timestamps as they are.",
             asdict(low_pass),
         )
 
@@ -202,8 +181,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
         largest = max(large_jumps, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
         positions = positions_of(analysis.source)
-        causes, action = JUMP_CAUSES[analysis.source.origin.kind]
-        cause = f"Possible causes: {causes}."
+        words = source_words(analysis.source)
+        cause = f"Possible causes: {words.jump}."
         evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
         if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
             evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
@@ -223,7 +202,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
             f"{positions} {jump_text} at {at_s:.1f} s and {end}. The IMU measures no such motion "
             f"(± {1.96 * sigma:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and their "
             "innovations stay consistent.",
-            f"{action} Analyse only the time before or after the jump (--start, --end).",
+            f"{words.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large_jumps),
         )
@@ -232,9 +211,14 @@ def detect_jumps(analysis: Analysis) -> Findings:
 def make_height_only_finding(analysis: Analysis) -> Finding:
     source, log = analysis.source, analysis.flight.log
     x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
-    parameter, action = EV_POS.switch, "Action: none, if the source measures only the height."
-    if int(log.parameters.get(parameter, 0.0)) == HEIGHT_ONLY_CONTROL:
-        action = f"Leave {parameter} at {HEIGHT_ONLY_CONTROL} (height only): it is correct."
+    parameter = EV_POS.switch
+    control = int(log.parameters.get(parameter, HEIGHT_ONLY_CONTROL))
+    action = f"Leave {parameter} at {control} (no horizontal position): it is correct."
+    if control & HORIZONTAL_CONTROL:
+        action = (
+            f"Set {parameter} to {control & ~HORIZONTAL_CONTROL | HEIGHT_ONLY_CONTROL} (height "
+            "only): now EKF2 fuses the constant x and y."
+        )
     return warning(
         "source_height_only",
         f"The coordinates x and y of {source.name} are constant ({x_m:g}, {y_m:g} m). Only the "
@@ -244,23 +228,14 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
     )
 
 
-def detect_relocalisation(analysis: Analysis) -> Findings:
-    """Detect jumps of a source that corrects its drift (VIO, SLAM) and reports a reset."""
-    source, segment, ekf2 = analysis.source, analysis.segment, analysis.flight.ekf2
-    position_m = source.samples[Columns.POSITION[:2]].dropna()
-    time_s, jumps = position_m.index.to_numpy(), []
-    steps_m = np.diff(position_m.to_numpy(), axis=0)
-    for reset_s in reset_times_s(source):
-        row = int(np.searchsorted(time_s, reset_s - RESET_TOLERANCE_S)) - 1
-        if not (segment.start_s < reset_s < segment.end_s and 0 < row < len(steps_m) - 1):
-            continue
-        motion_m = 0.5 * (steps_m[row - 1] + steps_m[row + 1])
-        size_m = float(np.linalg.norm(steps_m[row] - motion_m))
-        if size_m >= MIN_JUMP_M:
-            jumps.append((float(reset_s), size_m))
-    if len(jumps) < MIN_RELOCALISATIONS:
+def detect_repeated_jumps(analysis: Analysis) -> Findings:
+    """Detect a source that jumps again and again: it corrects its drift, or measures two points."""
+    ekf2 = analysis.flight.ekf2
+    jumps, is_announced = _find_jumps(analysis)
+    if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
         return
-    times_s, sizes_m = np.transpose(jumps)
+    times_s, steps_m = np.array([time_s for time_s, _ in jumps]), np.array([s for _, s in jumps])
+    sizes_m = np.linalg.norm(steps_m, axis=1)
     resets_s = [
         reset.time_s
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
@@ -278,16 +253,60 @@ def detect_relocalisation(analysis: Analysis) -> Findings:
             f"{np.median(waits_s):.1f} s later."
         )
     listed = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
+    returns = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    counter = "and its reset_counter rises at each jump"
+    cause = "the source (VIO or SLAM) drifts and corrects its drift"
+    if not is_announced:
+        counter = "without a change of reset_counter"
+        cause = f"possible causes are {source_words(analysis.source).jump}"
+    action = "Improve the tracking of the source, or correct the drift in smaller steps."
+    if returns.mean() >= MIN_RETURNS:
+        cause = f"the source measures two points in turn, {np.median(sizes_m):.2f} m apart"
+        action = "Send the position of one point of the vehicle."
     yield error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, and its "
-        f"reset_counter rises at each jump. The jumps are at {listed} s, about every "
-        f"{np.median(np.diff(times_s)):.0f} s: the source (VIO, SLAM) corrects its drift.{effect}",
-        "Improve the tracking of the source (light, texture, calibration of the camera), or "
-        "correct the drift in smaller steps. Analyse the time between two jumps (--start, --end).",
-        {"count": len(jumps), "largest_m": float(sizes_m.max())},
+        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter}. The "
+        f"jumps are at {listed} s, about every {np.median(np.diff(times_s)):.0f} s: {cause}."
+        f"{effect}",
+        f"{action} Analyse the time between two jumps (--start, --end).",
+        {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
         zero_length_spans(times_s.tolist()),
     )
+
+
+def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
+    """Return time (s) and step (m) of the jumps, and True if ``reset_counter`` announces them.
+
+    Jumps that are not announced must last, and be far above the noise.
+    """
+    position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
+        Columns.POSITION[:2]
+    ].dropna()
+    time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
+    if len(steps_m) < MIN_JUMP_ROWS:
+        return [], False
+    excess_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
+    size_m, interval_s = np.linalg.norm(excess_m, axis=1), np.diff(time_s)[1:-1]
+    resets = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
+    resets = resets[(resets >= 0) & (resets < len(size_m))]
+    resets = resets[size_m[resets] >= MIN_JUMP_M]
+    if len(resets) >= MIN_ANNOUNCED_JUMPS:
+        return [(float(time_s[row + 2]), excess_m[row]) for row in resets], True
+    usual_m = pd.Series(size_m).rolling(NOISE_SAMPLES, center=True, min_periods=1).median()
+    limit_m = np.maximum(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * usual_m.to_numpy())
+    is_jump = (size_m > limit_m) & (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s))
+    count = max(MIN_LASTING_SAMPLES, round(MIN_LASTING_S / float(np.median(interval_s))))
+    jumps = []
+    for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
+        before_m, after_m = (
+            position_m.iloc[max(row - count, 0) : row],
+            position_m.iloc[row:][:count],
+        )
+        around_m = steps_m[max(row - count, 0) : row + count]
+        lasting_m = after_m.median() - before_m.median() - count * np.median(around_m, axis=0)
+        if np.linalg.norm(lasting_m - excess_m[row - 2]) < MAX_LASTING_RATIO * size_m[row - 2]:
+            jumps.append((float(time_s[row]), excess_m[row - 2]))
+    return jumps, False
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
@@ -313,8 +332,8 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
-            "Measure a known distance with the source. Then survey the anchors again, and check "
-            "unit and calibration.",
+            "Measure a known distance with the source. Then check "
+            f"{source_words(analysis.source).scale}.",
             {"scale": 1.0 + excess, "sigma": sigma},
         )
 
@@ -337,7 +356,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     count, outlier_fraction = len(times_s), len(times_s) / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or count < MIN_OUTLIERS:
         return
-    possible_cause, action = OUTLIER_CAUSES[analysis.source.origin.kind]
+    words = source_words(analysis.source)
     sizes_m, reference = outlier_sizes_m(analysis, np.array(times_s))
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
@@ -346,9 +365,9 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
         f"{format_metres(float(np.median(sizes_m)))} m. "
-        f"Possible cause: {possible_cause}. KF has no gate and follows each "
+        f"Possible cause: {words.outliers}. KF has no gate and follows each "
         f"outlier.{_rejected(analysis, times_s)}",
-        action,
+        words.outliers_action,
         {
             "count": count,
             "share": outlier_fraction,
@@ -456,14 +475,12 @@ def hardly_moved(comparison: Comparison) -> bool:
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    # second differences are zero at constant velocity, so they show the noise
-    second_difference_m = np.median(np.abs(np.diff(positions.to_numpy(), 2, axis=0)), axis=0)
-    noise_m = float(second_difference_m.max()) / SECOND_DIFFERENCE_FACTOR
+    noise_m = white_noise_m(positions.to_numpy())
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
-    """Detect too little motion to identify velocity, heading and time offset."""
+    """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = motion_range_m(analysis)
     if hardly_moved(analysis):
         yield warning(

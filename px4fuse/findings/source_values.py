@@ -16,12 +16,14 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Findings, error, note, warning
-from px4fuse.findings.source_intervals import CHECKS, state_errors_after
+from px4fuse.findings.model import Findings, error, note, source_words, warning
+from px4fuse.findings.source_intervals import state_errors_after
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_of, source_name
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_STEP_M = 0.05
+# Maximum ratio of EKF2's position RMSE with the estimated lever arm to that as flown
+MAX_ERROR_RATIO = 0.7
 # Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
 MIN_OFFSET_M = 0.1
 # Minimum distance between the positions of two senders, in σ: white noise of one sender reaches 2
@@ -50,6 +52,11 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
         "source_position_held",
         "{positions} repeat the last position: the source has lost tracking",
         "Stop sending, or send NaN, while tracking is lost.",
+    ),
+    "far": (
+        "source_without_position",
+        "{positions} are more than 10 km from the other positions: another origin, or no fix",
+        "",
     ),
     "NaN": (
         "source_without_position",
@@ -97,7 +104,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             name,
             f"{fault}. Times of these positions: {times} ({total_s:.1f} s in total). KF does not "
             f"use them.{effect}",
-            action or f"Check {CHECKS[source.origin.kind]} at {longest_s[0]:.1f} s.",
+            action or f"Check {source_words(source).reception} at {longest_s[0]:.1f} s.",
             {"count": count, "longest_s": duration_s, "total_s": total_s, "at_s": longest_s[0]},
             spans,
         )
@@ -117,16 +124,18 @@ def detect_rounding(analysis: Analysis) -> Findings:
         return
     cause, action = "The source rounds the positions.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
-        cause = "A 32-bit float has this resolution at large coordinates, such as UTM."
-        action = (
-            "Subtract a local origin in double precision (64 bit) before the position becomes a "
+        cause = (
+            "Possible causes: the source rounds them, or they were 32-bit floats at large "
+            "coordinates, such as UTM."
+        )
+        action += (
+            " Subtract a local origin in double precision (64 bit) before the position becomes a "
             "32-bit float."
         )
     yield warning(
         "source_positions_rounded",
-        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The "
-        f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. "
-        f"{NO_ESTIMATES}",
+        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The rounding error is "
+        f"{step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. {NO_ESTIMATES}",
         action,
         {"step_m": step_m},
     )
@@ -143,11 +152,14 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if lever_arm is None:
         return
     forward_m, right_m, sigma_m = lever_arm
-    values = [
-        known + excess for known, excess in zip(source.lever_arm_m, lever_arm[:2], strict=False)
-    ]
-    parameters = aid_of(analysis).lever_arm
-    change = {name: round(value, 2) for name, value in zip(parameters, values, strict=False)}
+    values = (
+        np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
+    )  # + 0.0 removes a sign of zero
+    change = dict(zip(aid_of(analysis).lever_arm, values.tolist(), strict=False))
+    effect = _replayed_effect(analysis, change)
+    if effect is None:
+        return
+    forward_m, right_m = (round(part, 2) + 0.0 for part in (forward_m, right_m))
     sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
     if source.alignment is not None:  # EKF2 did not fuse the file
         sensor = "sensor"
@@ -157,14 +169,18 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
         f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
-        f"lever arm. {_replayed_effect(analysis, change)}{NO_ESTIMATES}",
+        f"lever arm. {effect}{NO_ESTIMATES}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 
 
-def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Return a sentence on EKF2's horizontal error in replays without and with a change."""
+def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
+    """Return a sentence on EKF2's horizontal error in replays without and with a change.
+
+    Return an empty text without a replay, and None if the change hardly reduces the error: the
+    position error then has another cause.
+    """
     model, truth = analysis.ekf2_model, analysis.flight.truth
     if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
         return ""
@@ -178,6 +194,8 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str:
             for name in Columns.POSITION[:2]
         ]
         sizes_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*errors))))))
+    if sizes_m[1] > MAX_ERROR_RATIO * sizes_m[0]:
+        return None
     before, after = map(format_metres, sizes_m)
     return f"Replay of EKF2 with this lever arm: horizontal position RMSE {before} m → {after} m. "
 
@@ -197,7 +215,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     direction = windows_m[np.argmax(np.linalg.norm(windows_m, axis=1))]
     windows_m[windows_m @ direction < 0.0] *= -1.0
     offset = np.median(windows_m, axis=0)
-    scatter_m = 1.4826 * float(np.median(np.abs(windows_m - offset)))
+    scatter_m = 1.4826 * float(np.median(np.abs(windows_m - offset), axis=0).max())
     size_m = float(np.linalg.norm(offset))
     if size_m < max(MIN_OFFSET_M, MIN_OFFSET_SIGMAS * scatter_m):
         return

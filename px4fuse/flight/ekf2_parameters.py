@@ -116,6 +116,8 @@ PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
 PARAMETER_RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
+# EKF2_MAG_TYPE without magnetometer
+NO_MAGNETOMETER = 5
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain

@@ -38,6 +38,16 @@ Spans = tuple[Span, ...]
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+# Reason why a source that measures only the height has no positions
+HEIGHT_ONLY = "x and y are NaN in all messages, so the source measures only the height"
+# Ratio of the median absolute second difference to the σ of white noise
+SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
+# Minimum number of positions to estimate their noise
+MIN_NOISE_SAMPLES = 10
+# Minimum noise (1 σ, m) of UWB positions
+MIN_UWB_NOISE_M = 0.03
+# Maximum rate (Hz) of UWB positions
+MAX_UWB_RATE_HZ = 25.0
 # Minimum time (s) on the ground between two flights: the land detector may report short landings
 MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
@@ -47,6 +57,7 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
     "vio": "VIO",
     "mocap": "MOCAP",
     "gnss": "GNSS",
+    "unknown": "external vision",
     "file": "position file",
 }
 
@@ -197,6 +208,27 @@ class PositionTrack:
         return sample_rate(self.samples)
 
 
+def white_noise_m(position_m: Array) -> float:
+    """Estimate the white noise (1 σ, m) of positions from second differences, shape (n, axes).
+
+    Second differences are zero at constant velocity. The result is that of the noisiest axis.
+    """
+    second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
+    return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_FACTOR
+
+
+def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
+    """Return "uwb" for noisy positions at a low rate; else the sensor is "unknown".
+
+    Motion capture, odometry and other precise systems may also send positions only.
+    """
+    position_m = samples[Columns.POSITION[:2]].dropna().drop_duplicates().to_numpy()
+    if len(position_m) < MIN_NOISE_SAMPLES:
+        return "unknown"
+    is_uwb = white_noise_m(position_m) > MIN_UWB_NOISE_M and sample_rate(samples) < MAX_UWB_RATE_HZ
+    return "uwb" if is_uwb else "unknown"
+
+
 def source_name(source: PositionTrack) -> str:
     """Return the name of a position source for users, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
@@ -255,6 +287,7 @@ RECORD_NOT_LOGGED = Unavailable(
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+DEAD_RECKONING = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
@@ -288,7 +321,8 @@ class FusionRecord:
     # Updates of the height bias of each aiding source relative to the height reference: ``bias_m``
     # and ``bias_m2`` after the update, ``innovation_m`` and its ``variance_m2``
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # 1 while EKF2 detects GROUND_EFFECT on the barometer, or BAD_ACCELERATION (vertical)
+    # 1 while EKF2 reports GROUND_EFFECT on the barometer, BAD_ACCELERATION (vertical), or inertial
+    # DEAD_RECKONING
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr

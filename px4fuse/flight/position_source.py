@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from px4fuse.core.record import Record
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
-PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
+PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 DataPath = Literal[
     "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
 ]
@@ -16,7 +16,8 @@ DataPath = Literal[
 class Origin(Record, frozen=True):
     """Kind of a position source, and the path of its positions from the sender to the log."""
 
-    # "uwb" is any positioning system without orientation, "vio" is any odometry
+    # "vio" is any source with a changing orientation, "uwb" a noisy one without orientation, and
+    # "unknown" another one without orientation (kind_without_orientation)
     kind: PositionKind
     path: DataPath
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
@@ -53,9 +54,10 @@ class Origin(Record, frozen=True):
 
     @property
     def is_gnss(self) -> bool:
-        """True for GNSS, whose multipath and atmospheric errors are correlated over minutes.
+        """True for GNSS.
 
-        R must be larger than the variance estimated from differences of consecutive positions.
+        Multipath and atmospheric errors are correlated over minutes, so R must be larger than the
+        variance of the differences of consecutive positions.
         """
         return self.kind == "gnss"
 

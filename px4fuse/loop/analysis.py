@@ -24,7 +24,7 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum value (s) that options state as UNIX time; smaller times count from the first pose
+# Minimum time (s) in an option that is UNIX time; a smaller time counts from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0

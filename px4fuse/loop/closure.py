@@ -13,7 +13,7 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# Order and signs of x, y and z in a frame with z down, name of this frame, and note for the user
+# Order and signs of the axes that convert each frame to one with z down, its name, and a note
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],

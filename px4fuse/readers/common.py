@@ -15,6 +15,10 @@ MAX_IMU_VALUE = 1e4
 # Minimum distance (m) of a position 0, 0, 0 from its neighbours to reject it as not measured: 3 σ
 # of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
+# Minimum distance (m) of a position from the median position to reject it as not measured
+MIN_FAR_M = 1e4
+# Minimum distance of such a position in median distances
+MIN_FAR_RATIO = 100.0
 # Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
 # sources that send each position several times repeat it for a shorter time
 MIN_HELD_S = 1.0
@@ -82,6 +86,12 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
         distance_m = np.linalg.norm(values[neighbours], axis=2).min(axis=0)
         reason.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
     valid_rows = np.flatnonzero(reason == "")
+    if len(valid_rows):
+        from_median = values[valid_rows] - np.median(values[valid_rows], axis=0)
+        distance_m = np.linalg.norm(from_median, axis=1)
+        is_far = distance_m > max(MIN_FAR_M, MIN_FAR_RATIO * float(np.median(distance_m)))
+        reason.iloc[valid_rows[is_far]] = "far"
+        valid_rows = valid_rows[~is_far]
     is_same = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     starts = np.flatnonzero(np.append(True, ~is_same))
     held_rows = [

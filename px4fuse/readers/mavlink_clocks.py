@@ -144,8 +144,10 @@ def map_clock(
     ----------
     boot_of_receipt : Line
         Map from receive time to boot clock.
-    replies, answers : tuple of ndarray, s
-        TIMESYNC clock readings at request and reply: requests of the autopilot, and of the sender.
+    replies : tuple of ndarray
+        Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
+    answers : tuple of ndarray
+        Times (s) of the sender's TIMESYNC requests, and of the autopilot's replies.
     map_boot_to_unix : Line or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool

@@ -182,8 +182,8 @@ def clock_maps(
         note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = (
-                "this map is estimated from the messages with the least delay, and only orders "
-                "messages and maps other clocks"
+                "this conversion is estimated from the messages with the least delay; it is only "
+                "used to order messages and to convert other clocks"
             )
         clocks.append(
             ClockMap(

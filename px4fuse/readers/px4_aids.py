@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, DISTURBANCES, Aid
+from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
@@ -23,6 +23,13 @@ from px4fuse.readers.ulog_topics import Topics
 # Maximum time difference (s) between an innovation and the logged variance S: the default logging
 # profile logs both topics every 0.5 s, and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
+# Fields of estimator_aid_src topics that are read if they are logged, by column name and aid
+LAST_FUSED = {"last_fused_us": "time_last_fuse"}
+OPTIONAL_FIELDS = {
+    "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
+    "ev_pos": LAST_FUSED,
+    "gnss_pos": LAST_FUSED,
+}
 
 
 def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
@@ -86,13 +93,12 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
         )
     }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
-    barometer_columns = {"observation_down": "observation", "filtered_down": "innovation_filtered"}
-    layout = Layout(
-        f"estimator_aid_src_{aid.name}", columns, barometer_columns if aid == BAROMETER else {}
-    )
+    layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
     if topics.find(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
+    if "last_fused_us" in samples:
+        samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.zero_us) * 1e-6
     if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
         samples["fused"] = step_values_at(enabled, samples.index)
     return _make_aid_log(topics, (layout.topic,), aid, samples, enabled)

@@ -91,7 +91,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled_aids = read_enabled_aids(topics)
-    fusion_flags = _read_fusing(topics, enabled_aids)
+    fusion_flags = _read_fusion_flags(topics, enabled_aids)
     gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled_aids)
     innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, gate)
@@ -274,7 +274,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     return pd.Series(dtype=np.float64)
 
 
-def _read_fusing(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
+def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled_aids.keys():

@@ -142,7 +142,9 @@ def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     nis = {
         name: samples[f"innovation_{name}"] ** 2 / samples[f"variance_{name}"] for name in log.axes
     }
-    is_beyond_gate = pd.DataFrame(nis).max(axis=1) > gate**2
+    rejected = samples.get("rejected")
+    if rejected is None:
+        rejected = (pd.DataFrame(nis).max(axis=1) > gate**2).astype(float)
     innovations = pd.DataFrame(
         {
             "innovation_m": samples[f"innovation_{axis}"],
@@ -150,7 +152,7 @@ def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
             "observation_variance_m2": samples.get(f"noise_{axis}", np.nan),
             "test_ratio": nis[axis] / gate**2,
             "fused": samples.get("fused", np.nan),
-            "rejected": samples.get("rejected", is_beyond_gate.astype(float)),
+            "rejected": rejected,
         }
     )
     return innovations[

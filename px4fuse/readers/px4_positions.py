@@ -13,12 +13,14 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import (
+    HEIGHT_ONLY,
     NO_INVALID_ROWS,
     Columns,
     Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
+    kind_without_orientation,
     sample_rate,
     time_index,
 )
@@ -119,6 +121,8 @@ def make_track(
     """
     status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
+    is_nan = samples[Columns.POSITION].isna().to_numpy()
+    is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
     step_m = max(rounding_step(samples[name].to_numpy()) for name in needed_columns[:2])
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
@@ -126,11 +130,12 @@ def make_track(
         reason = find_invalid(samples, needed_columns)
         samples, invalid = samples[reason == ""], reason[reason != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
-        return unavailable(
-            name,
-            f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}",
-            remedy,
-        )
+        fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
+        if is_height_only:
+            fault = HEIGHT_ONLY
+        return unavailable(name, fault, remedy)
+    if origin.kind == "uwb":
+        origin = structs.replace(origin, kind=kind_without_orientation(samples))
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -181,11 +186,18 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
         samples["age_s"] = published_s - samples.index
     orientation = read_orientation(samples)
+    notes: tuple[str, ...] = ()
+    if not is_ekf2 and (count := len(topics.instances(layout.topic))) > 1:
+        notes = (
+            f"{layout.topic} has {count} instances: {count} programs publish it. px4fuse and EKF2 "
+            "use instance 0.",
+        )
     return _make_ulog_track(
         topics,
         name,
         samples,
         (layout.topic,),
+        notes=notes,
         is_odometry=orientation is not None,
         frame=frame,
         clock_map=_arrival_clock_map(topics, layout.topic),
@@ -372,9 +384,13 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    If ``origin`` is None, the first sample is the origin.
+    If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
+    latitude and longitude 0: these samples become NaN.
     """
-    latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
+    global_positions = global_positions[GLOBAL_COLUMNS].mask(
+        (global_positions[GLOBAL_COLUMNS[:2]] == 0.0).all(axis=1)
+    )
+    latitude, longitude, altitude = global_positions.to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
     ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}

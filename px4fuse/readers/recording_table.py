@@ -146,7 +146,7 @@ def find_table(
     if _is_complete(last_line, whole_lines.rpartition("\n")[2]):
         text += f"{last_line}\n"
     elif last_line.strip():
-        notes.append("the last line of the position file was dropped, because it has no line end")
+        notes.append("the last line of the position file was dropped, because it is incomplete")
     table = None if columns else _find_json(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]

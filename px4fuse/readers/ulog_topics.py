@@ -283,7 +283,7 @@ class Topics:
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the instance that was primary at each time.
 
-        The frame is empty if the layout is not in the log.
+        The result is empty if the topic is not in the log.
 
         Parameters
         ----------

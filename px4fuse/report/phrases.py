@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from px4fuse.comparison.model import (
     AxisComparison,
     Comparison,
@@ -12,6 +14,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UntestedFilter,
 )
+from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
@@ -20,7 +23,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.log import ClockMap
-from px4fuse.flight.model import Alignment, Truth, Unavailable
+from px4fuse.flight.model import Alignment, Columns, Truth, Unavailable
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -164,9 +167,8 @@ def format_clock_map(clock: ClockMap) -> str:
     if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
-        f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, "
-        f"drift {clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1000.0:.2g} ms, "
-        f"{clock.pairs} pairs"
+        f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
+        f"{clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1000.0:.2g} ms, {clock.pairs} pairs"
     ) + (f"; {clock.note}" if clock.note else "")
 
 
@@ -203,9 +205,8 @@ def tuning_advice(
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
-            "The position source may drift. The estimates describe the noise without the "
-            "drift. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
-            "ground truth or a loop."
+            "The position source may drift. The estimates describe the noise without the drift. Do "
+            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
     options = [
         f" {option} {noise.value:.3g}"
@@ -227,10 +228,17 @@ def tuning_advice(
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         flown_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
-        noise_m = noise_change(EV_POS, log.parameters, 0.0, sigma_z.value)[name]
+        variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
+        reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+        changes = noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
         current_value = "" if flown_m is None else f" (now {flown_m:g} m)"
-        advice["PX4"] = f"Set {name} to {noise_m:g} m{current_value}."
-        if flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (sigma_z.high or 0.0):
+        advice["PX4"] = f"Set {name} to {changes[name]:g} m{current_value}."
+        is_within = flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (sigma_z.high or 0.0)
+        if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
+            advice["PX4"] = (
+                f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
+            )
+        elif is_within:
             advice["PX4"] = f"{name} {flown_m:g} m is within the 95 % interval."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (

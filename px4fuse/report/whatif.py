@@ -169,8 +169,8 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         text = (
-            "No other noise or delay fits this log better than EKF2's parameters, so nothing is "
-            "changed. Test another value with --set NAME=VALUE."
+            "No other position noise or delay fits this log better, so no parameter is changed. "
+            "Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", text)
     head = ["", *column_heads(analysis)]

@@ -481,9 +481,9 @@ def parse_late_rule(text: str) -> LateRule:
 def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
-    ``name`` is the name of the time in errors. The default time zone is ``default_zone``, else that
-    of this computer. A date without a time means the end of the day,
-    and a time without seconds the end of the minute.
+    A date without a time means the end of the day, and a time without seconds the end of the
+    minute. The default time zone is ``default_zone``, or else that of this computer. Errors contain
+    ``name``, the name of the option.
 
     Raises
     ------

@@ -54,7 +54,7 @@ class PoseGraph:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Length of a tangent: 3 in the plane, 6 in space."""
+        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
     @property
