@@ -456,9 +456,8 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
         return (
-            f"The verdicts of {filters} against source and ground truth differ: innovations "
-            "hardly show this fault. The re-run with the first action removes most of the "
-            "position error."
+            f"The verdicts of {filters} against source and ground truth differ: innovations hardly "
+            "show this fault. The re-run with the first action removes most of the position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -493,8 +492,7 @@ def _gate_sentence(analysis: Analysis) -> str:
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
         f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, which its mean "
-        "NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is "
-        f"{format_ratio(ratio)}."
+        f"NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is {format_ratio(ratio)}."
     )
 
 

@@ -20,9 +20,8 @@ READER_TIMEOUT_S = 5.0
 LOCKS_OPEN_FILES = sys.platform == "win32"
 # Action if an output cannot be written, by error number
 REMEDIES = {
-    errno.ENOSPC: "Free disk space, or choose an output folder on another disk.",
-    errno.EROFS: "Choose an output folder that can be written.",
-    errno.EACCES: "Choose an output folder that can be written.",
+    errno.ENOSPC: "Free disk space, or choose another disk.",
+    errno.EROFS: "Choose a folder that can be written.",
 }
 # Maximum number of paths that a message lists; if there are more, it contains their number
 _MAX_LISTED = 4

@@ -167,7 +167,7 @@ def _with_missing_innovations(
         Innovations of the k samples before each of n logged rows.
     interval_s : ndarray, shape (n, 1)
         Time between two samples.
-    age : ndarray, shape (n, k)
+    age_samples : ndarray, shape (n, k)
         Number of samples from each sample to its row.
     filtered_m : ndarray, shape (n + 1,)
         Low-pass filtered innovation, at the start and at each row.

@@ -560,7 +560,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 
 
 def _reduce_variance_to(P: Array, row: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance after an update that reduces a state's variance to ``target``."""
+    """Return gain and covariance after an update that reduces a state's variance to a target."""
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target_variance)
     K = P[:, :, row] / (variance + R)[:, None]

@@ -95,7 +95,7 @@ def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:
-    """Delay values by ``lag`` steps; the first value is repeated."""
+    """Delay values by ``lag_steps``; the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 

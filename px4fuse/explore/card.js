@@ -2,7 +2,7 @@
    as in px4fuse.card. */
 const Card = (() => {
   const NAMES = { source: "the source", truth: "ground truth" };
-  // format_ratio and format_metres of card/numbers.py
+  // format_ratio and format_metres of core/text.py
   const formatRatio = (x) => x.toFixed(x >= 9.95 ? 0 : x >= 1.995 ? 1 : x >= 0.00995 ? 2 : 3);
   const formatMetres = (m) => `${m.toFixed(m >= 99.95 ? 0 : m >= 9.995 ? 1 : m >= 0.0995 ? 2 : 3)} m`;
   const factor = (ratio) => Math.max(ratio, 1 / ratio);

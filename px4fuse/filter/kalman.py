@@ -7,8 +7,8 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
                x = x + Ky         P = (I - KH)P
 
 F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps in
-:mod:`px4fuse.filter.steps`. :mod:`~px4fuse.filter.likelihood` runs KF for many settings together;
-the results are equal to 1e-9.
+:mod:`px4fuse.filter.steps`. :mod:`~px4fuse.filter.likelihood` runs KF with fewer predictions; the
+results are equal to 1e-9.
 """
 
 from collections.abc import Sequence

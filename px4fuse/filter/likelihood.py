@@ -1,8 +1,7 @@
-"""KF for grids of settings: innovations, likelihood and 95 % intervals.
+"""KF with one prediction per position measurement, and 95 % intervals from the likelihood.
 
-The input is integrated between position measurements, so KF needs one prediction per measurement
-instead of one per DT. All settings of a grid are computed together as an array. For SIGMA_A and
-SIGMA_Z of at least 1e-3 the results equal those of :func:`px4fuse.filter.kalman.replay` to 1e-9.
+The input is integrated between measurements, so KF needs no prediction per DT. With SIGMA_A
+and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from __future__ import annotations

@@ -175,8 +175,7 @@ def estimate_time_offset(
         ).noises
         curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSETS)
         fit = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
-        total_scores = fit.scores()[0]
-        offset_s, sigma_s = _minimum_and_sigma(curve_s, total_scores)
+        offset_s, sigma_s = _minimum_and_sigma(curve_s, fit.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
     while True:
         nodes_s, curve_s = (

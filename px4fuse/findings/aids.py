@@ -130,10 +130,9 @@ def detect_in_aids(
             s_sqrt = aid.axes[axis].s_sqrt_median
             yield warning(
                 "aid_innovation_shift",
-                f"{label}: the {axis} innovation shifts by "
-                f"{format_number(abs(shift) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. The mean "
-                f"innovation before and after differs by {abs(shift):.1f} √S (√S "
-                f"{format_number(s_sqrt, 2)} {aid.unit}).",
+                f"{label}: the {axis} innovation shifts by {format_number(abs(shift) * s_sqrt, 2)} "
+                f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
+                f"{abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
                 f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
                 ((time_s, time_s + WINDOW_S),),

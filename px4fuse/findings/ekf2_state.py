@@ -92,8 +92,8 @@ def _detect_limited_bias(
             if abs(force_m_s2 - GRAVITY_M_S2) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {GRAVITY_M_S2:.2f}: the bias is "
-                    f"{GRAVITY_M_S2 - force_m_s2:+.2f} m/s² down."
+                    f"instead of {GRAVITY_M_S2:.2f}: the bias is {GRAVITY_M_S2 - force_m_s2:+.2f} "
+                    "m/s² down."
                 )
         yield error(
             "ekf2_bias_at_limit",

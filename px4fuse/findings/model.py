@@ -67,8 +67,6 @@ class SourceWords(Record, frozen=True):
     outliers: str
     outliers_action: str
     reception: str
-    noise: str
-    unequal_axes_action: str
     scale: str
     errors: str
 
@@ -96,7 +94,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
-    if message[1:2] != " ":  # "x and y are exchanged" names axes
+    if message[1:2] != " ":  # "x and y are exchanged" begins with an axis
         message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)

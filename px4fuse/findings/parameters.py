@@ -1,7 +1,6 @@
 """EKF2 parameters that change in flight, with the consistency of EKF2 before and after."""
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +10,12 @@ from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess
-from px4fuse.findings.model import Findings, format_percent, fraction_on, note, warning
+from px4fuse.findings.model import Findings, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum ratio of two values (σ ratio, position RMSE) before and after a change, for a warning
 MIN_EFFECT = 1.5
-# Minimum change of the fraction of time in which EKF2 fuses the positions, for a warning
-MIN_FUSING_CHANGE = 0.5
 
 
 class Part(NamedTuple):
@@ -27,7 +24,6 @@ class Part(NamedTuple):
     verdict: str
     sigma_ratio: float
     rmse_m: float
-    fused_fraction: float
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -44,16 +40,9 @@ def detect(analysis: Analysis) -> Findings:
     for number, (time_s, name, before, after) in enumerate(changes):
         old, new = (_part(analysis, *edges_s[i : i + 2]) for i in (number, number + 1))
         unit = "" if name in switches else f" {PARAMETERS[name].printed_unit}".rstrip()
-        effect, has_effect = "", False
-        since = "before the change and {} after it"
-        if abs(new.fused_fraction - old.fused_fraction) > MIN_FUSING_CHANGE:
-            has_effect = True
-            effect += (
-                f" EKF2 fuses the positions {format_percent(old.fused_fraction)} of the time "
-                f"{since.format(format_percent(new.fused_fraction))}."
-            )
-        elif old.verdict and new.verdict:
-            has_effect = _differ(old.sigma_ratio, new.sigma_ratio)
+        effect, has_effect = "", name in switches
+        if old.verdict and new.verdict:
+            has_effect |= _differ(old.sigma_ratio, new.sigma_ratio)
             effect = (
                 f" EKF2 is {old.verdict} before the change and {new.verdict} after it "
                 "(innovations along the main axis)."
@@ -62,7 +51,7 @@ def detect(analysis: Analysis) -> Findings:
             has_effect = True
             effect += (
                 f" EKF2's position RMSE along the main axis is {format_metres(old.rmse_m)} m "
-                f"{since.format(f'{format_metres(new.rmse_m)} m')}."
+                f"before the change and {format_metres(new.rmse_m)} m after it."
             )
         action = (
             "Analyse the flight before and after the change separately "
@@ -86,26 +75,22 @@ def _differ(before: float, after: float) -> bool:
 
 def _part(analysis: Analysis, start_s: float, end_s: float) -> Part:
     """Describe EKF2 in a time span."""
-    ekf2, nan = analysis.flight.ekf2, float("nan")
-    rmse_m, fused = nan, nan
+    unknown, rmse_m = float("nan"), float("nan")
     errors = position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = float(np.sqrt((errors["error_m"].loc[start_s:end_s] ** 2).mean()))
-    if isinstance(ekf2, Ekf2) and not isinstance(ekf2.fusion_flags, Unavailable):
-        span = replace(analysis.segment, start_s=start_s, end_s=end_s)
-        fused = fraction_on(ekf2.fusion_flags["horizontal"], span)
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return Part("", nan, rmse_m, fused)
+        return Part("", unknown, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     result = assess(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     if isinstance(result, Unavailable):
-        return Part("", nan, rmse_m, fused)
+        return Part("", unknown, rmse_m)
     direction = "small" if result.sigma_ratio > 1.0 else "large"
     factor = format_ratio(result.sigma_error_factor)
     verdict = f"{result.verdict} (σ {factor} times too {direction})"
     if result.verdict == "consistent":
         verdict = result.verdict
-    return Part(verdict, result.sigma_ratio, rmse_m, fused)
+    return Part(verdict, result.sigma_ratio, rmse_m)

@@ -22,8 +22,8 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
 LARGE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of the heading drift against ground truth to that against the positions, for a drift
-# of EKF2's heading
+# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions; if
+# the ratio is smaller, the heading of the positions drifts
 MIN_TRUE_DRIFT_FRACTION = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"

@@ -39,7 +39,7 @@ MAX_DIVISOR = 4
 # Minimum time (s) without positions at the start or end of the flight for a finding: the land
 # detector is seconds late
 MIN_PARTIAL_S = 3.0
-# Time (s) from the evaluation of KF to the next position
+# KF is evaluated this time (s) before a position, which is before its update
 SMALLEST_TIME_S = 1e-6
 
 

@@ -137,7 +137,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         f"{source_name(analysis.source)} noise is {larger_m:.2g} m along "
         f"{noisy_axis} and {smaller_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
         "measurement noise, does not fit both axes.",
-        f"{source_words(analysis.source).unequal_axes_action} Analyse each axis separately "
+        f"Check {source_words(analysis.source).errors}. Analyse each axis separately "
         f"(--axis {noisy_axis} --sigma-z {larger_m:.2g}).",
         {f"{quiet_axis}_sigma_z_m": smaller_m, f"{noisy_axis}_sigma_z_m": larger_m},
     )
@@ -158,8 +158,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         f"{source_name(analysis.source)} noise is {ratio:.1f} times larger from "
         f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
         "No single SIGMA_Z fits the whole flight.",
-        f"Check {source_words(analysis.source).noise} in that time. Let the source send a variance "
-        "with each position, or analyse this time separately (--start, --end).",
+        f"Check {source_words(analysis.source).reception} in that time. Let the source send a "
+        "variance with each position, or analyse this time separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},
         ((start, end),),
     )

@@ -332,7 +332,8 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
-            f"Measure a known distance with the source. {source_words(analysis.source).scale}.",
+            "Measure a known distance with the source. Then check "
+            f"{source_words(analysis.source).scale}.",
             {"scale": 1.0 + excess, "sigma": sigma},
         )
 
@@ -479,7 +480,7 @@ def hardly_moved(comparison: Comparison) -> bool:
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
-    """Detect too little motion to identify velocity, heading and time offset."""
+    """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = motion_range_m(analysis)
     if hardly_moved(analysis):
         yield warning(

@@ -140,8 +140,7 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
-            "synchronised with the autopilot (TIMESYNC), so every position is late by its "
-            "latency.",
+            "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
             ANSWER_TIMESYNC,
             {"until_s": float(age.index[-1])},
         )

@@ -134,9 +134,8 @@ def detect_rounding(analysis: Analysis) -> Findings:
         )
     yield warning(
         "source_positions_rounded",
-        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The "
-        f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. "
-        f"{NO_ESTIMATES}",
+        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The rounding error is "
+        f"{step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. {NO_ESTIMATES}",
         action,
         {"step_m": step_m},
     )

@@ -140,6 +140,8 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
     if quaternions is None:
         return None
     norms = np.linalg.norm(quaternions, axis=1)
+    if not np.nan_to_num(norms).any():  # zeros or NaN: the file has positions only
+        return None
     if not (np.abs(norms - 1.0) <= MAX_NORM_ERROR).all():
         raise TrajectoryError(
             f"{recording.name}: a quaternion does not have norm 1",

@@ -128,8 +128,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
-        "were not fused. Grey: fusion was disabled. Triangles: values beyond "
-        f"±{MAX_NORMALISED:g}."
+        f"were not fused. Grey: fusion was disabled. Triangles: values beyond ±{MAX_NORMALISED:g}."
     )
     for name in fused_names:
         _draw_aid_panel(

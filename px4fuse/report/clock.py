@@ -103,12 +103,10 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         return
     page = Page(
         "Appendix: time offset of the position source",
-        (
-            "Late or early timestamps hardly change the innovations, because the filter "
-            "follows the positions. px4fuse maximises the likelihood of the positions over the "
-            "time offset, together with sensor biases, attitude errors and noises. The attitude "
-            "is from the gyros, because the same positions have corrected EKF2's attitude."
-        ),
+        "Late or early timestamps hardly change the innovations, because the filter "
+        "follows the positions. px4fuse maximises the likelihood of the positions over the "
+        "time offset, together with sensor biases, attitude errors and noises. The attitude "
+        "is from the gyros, because the same positions have corrected EKF2's attitude.",
     )
     page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s

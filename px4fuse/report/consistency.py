@@ -65,11 +65,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     axis_text = result.axis.label
     page = Page(
         "Appendix: consistency",
-        (
-            "Innovations ν of a consistent filter have variance S (mean NIS = mean of ν²/S = 1), "
-            "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
-            f"along {axis_text}; the table lists all axes."
-        ),
+        "Innovations ν of a consistent filter have variance S (mean NIS = mean of ν²/S = 1), "
+        "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
+        f"along {axis_text}; the table lists all axes.",
     )
     series = _series(result)
     if series:
@@ -151,11 +149,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
-        (
-            "Each row is a re-run with one changed setting. 'explains' is the reduction of the "
-            "logarithm of the quantity (for distances: of the mean square); 'all' means that the "
-            "re-run is consistent. A change that explains 50 % or more is a cause."
-        ),
+        "Each row is a re-run with one changed setting. 'explains' is the reduction of the "
+        "logarithm of the quantity (for distances: of the mean square); 'all' means that the "
+        "re-run is consistent. A change that explains 50 % or more is a cause.",
         colour=MUTED_COLOUR,
     )
 

@@ -45,11 +45,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         return
     page = Page(
         TITLE,
-        (
-            "KF is replayed with its settings and equations replaced by those of EKF2, one at "
-            "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
-            "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %."
-        ),
+        "KF is replayed with its settings and equations replaced by those of EKF2, one at "
+        "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
+        "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %.",
     )
     for name, explanation in explanations.items():
         if isinstance(explanation, Unavailable):

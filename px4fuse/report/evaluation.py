@@ -53,10 +53,8 @@ ERROR_TABLE_HEAD = (
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
     page = Page(
         "Trajectory error",
-        (
-            "APE: distance of one pose from the reference (its RMSE over all poses is "
-            "the ATE). RPE: error of the relative motion over a fixed distance or time."
-        ),
+        "APE: distance of one pose from the reference (its RMSE over all poses is "
+        "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
     page.write(summary(evaluation), size=9.0, bold=True)
     write_evaluation(page, evaluation)

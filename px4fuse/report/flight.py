@@ -121,9 +121,8 @@ def zoom_sentence(result: AxisComparison) -> str:
         change_text = f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {reduction:.0%} less variance"
         if name == "KF":
             change_text = (
-                "σ grows in each prediction (SIGMA_A "
-                f"{result.replay.settings.sigma_a_m_s2:g} m/s²) and decreases with each "
-                f"measurement ({change_text})"
+                f"σ grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} "
+                f"m/s²) and decreases with each measurement ({change_text})"
             )
         texts.append(change_text)
     return f"{'; '.join(texts)}." if texts else ""

@@ -85,11 +85,9 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     page.legend(axes.get_legend_handles_labels()[0])
     page.heading("Loop closures and scores")
     page.write(
-        (
-            "d²: squared Mahalanobis distance of the closure given drift and closure "
-            "noise. p: probability of a larger d² for a true closure. GNC weight: "
-            "1 if the closure is used, 0 if it is excluded."
-        ),
+        "d²: squared Mahalanobis distance of the closure given drift and closure "
+        "noise. p: probability of a larger d² for a true closure. GNC weight: "
+        "1 if the closure is used, 0 if it is excluded.",
         colour=MUTED_COLOUR,
     )
     write_scores(page, loop)
@@ -180,10 +178,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         ],
     )
     page.write_small(
-        (
-            "ATE: position RMSE after alignment, with its 95 % interval (block "
-            "bootstrap) if the flight is long enough."
-        )
+        "ATE: position RMSE after alignment, with its 95 % interval (block "
+        "bootstrap) if the flight is long enough."
         if names
         else (
             "The error of the path is unknown without ground truth or reference "
@@ -339,10 +335,8 @@ def graph_summary(solved_graph: Graph) -> Page:
     page = Page()
     page.write_labelled(
         "Graph",
-        (
-            f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
-            f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}"
-        ),
+        f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
+        f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
     gates = solved_graph.gates
     if isinstance(gates, Unavailable):

@@ -167,9 +167,8 @@ def format_clock_map(clock: ClockMap) -> str:
     if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
-        f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, "
-        f"drift {clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1000.0:.2g} ms, "
-        f"{clock.pairs} pairs"
+        f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
+        f"{clock.drift_ppm:+.3g} ppm, jitter {clock.jitter_s * 1000.0:.2g} ms, {clock.pairs} pairs"
     ) + (f"; {clock.note}" if clock.note else "")
 
 
@@ -206,9 +205,8 @@ def tuning_advice(
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
-            "The position source may drift. The estimates describe the noise without the "
-            "drift. Do not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by "
-            "ground truth or a loop."
+            "The position source may drift. The estimates describe the noise without the drift. Do "
+            "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
     options = [
         f" {option} {noise.value:.3g}"

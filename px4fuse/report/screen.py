@@ -142,15 +142,10 @@ def print_line(console: Console, label: str, text: str, style: str = "bold cyan 
 def _print_rows(
     console: Console, head: Sequence[str], rows: Iterable[Iterable[Cell]], **_: object
 ) -> None:
-    """Print a table on a narrow terminal as one paragraph per row, with the title of each cell."""
-    for row in rows:
-        texts = [cell if isinstance(cell, str) else cell[0] for cell in row]
-        cells = [
-            f"{' '.join(title.split())} {text}".strip()
-            for title, text in zip(head, texts, strict=True)
-            if text
-        ]
-        print_paragraph(console, ", ".join(cells), indent=2)
+    """Print a table on a narrow terminal as one paragraph per row."""
+    for row in (head, *rows):
+        texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
+        print_paragraph(console, ", ".join(filter(None, texts)), indent=2)
 
 
 def _rich_table(

@@ -15,6 +15,8 @@ Method = Literal["interpolate", "nearest"]
 
 # Default of the maximum gap in the reference to interpolate over, in median intervals
 MAX_GAP_INTERVALS = 3.0
+# Minimum interval (s) of a reference whose poses are paired instead of interpolated
+MIN_SPARSE_INTERVAL_S = 2.0
 # Lower limit (s) of the default of the maximum gap
 MIN_GAP_LIMIT_S = 0.1
 # Maximum time difference (s) of two poses that are paired: default of the evo package
@@ -70,6 +72,12 @@ def associate(
     TrajectoryError
         Fewer than three poses match.
     """
+    # interpolation over seconds would invent the path of a sparse reference
+    estimate_interval_s = median_interval(estimate.time_s)
+    if method == "interpolate" and max_gap_s is None:
+        reference_interval_s = median_interval(reference.time_s)
+        if reference_interval_s > max(MIN_SPARSE_INTERVAL_S, 2.0 * estimate_interval_s):
+            method, max_gap_s = "nearest", estimate_interval_s
     time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
         limit_s = end_tolerance_s = MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
@@ -94,7 +102,7 @@ def associate(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
     )
     steps_s = np.diff(time_s[pose_indices])
-    max_step_s = max(5.0 * median_interval(estimate.time_s), 0.5)
+    max_step_s = max(5.0 * estimate_interval_s, 0.5)
     covered_fraction = float(steps_s[steps_s <= max_step_s].sum() / (last_s - first_s))
     used_count = len(np.unique(pose_indices))
     all_poses = len(estimate)
