@@ -232,7 +232,7 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
 
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
-    """Detect a source that jumps repeatedly: it corrects its drift, or alternates between points."""
+    """Detect a source that jumps repeatedly: it corrects drift, or alternates between points."""
     ekf2 = analysis.flight.ekf2
     jumps, is_announced = _find_jumps(analysis)
     if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
