@@ -15,10 +15,10 @@ from px4fuse.classroom.grading import grade as grading
 from px4fuse.classroom.grading import records
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item
 from px4fuse.core import workers
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256, verify
 
-VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
+VERIFIED = Verification("verified", ("the log gives every value again",), True, page_status="same")
 
 
 def make_report(name: str, student_id: str, log: str = "") -> bytes:

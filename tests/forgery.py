@@ -26,7 +26,7 @@ from px4fuse.errors import ResultsError
 from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import Recomputed, verify
 
 Forge = Callable[[PdfWriter], Any]
@@ -204,7 +204,9 @@ class VerifiedReport:
     again: Recomputed
     files: Mapping[str, Path]
 
-    def recompute(self, results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
+    def recompute(
+        self, results: ReportedResults, logs: Mapping[str, Path]
+    ) -> Recomputed | Verification:
         """Return the analysis; the stored one if request, student, log and versions are equal."""
         ours, theirs = (
             # the command is derived from the request
@@ -214,12 +216,12 @@ class VerifiedReport:
         )  # fmt: skip
         return self.again if ours == theirs else verification.recompute(results, logs)
 
-    def verified(self, pdf: bytes) -> Verdict:
+    def verified(self, pdf: bytes) -> Verification:
         """Verify a forged report with the log."""
         try:
             report = attached_results(pdf)
         except ResultsError as error:  # rejected before verification
-            return Verdict("cannot verify", (str(error),), with_log=False)
+            return Verification("cannot verify", (str(error),), with_log=False)
         return verify(report, pdf, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:

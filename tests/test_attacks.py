@@ -40,7 +40,7 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import cannot_verify
 
@@ -74,7 +74,7 @@ class Flight:
     key: AnswerKey
 
     def graded(
-        self, report: ReportedResults | ResultsError, verdict: Verdict, rubric: Rubric
+        self, report: ReportedResults | ResultsError, verdict: Verification, rubric: Rubric
     ) -> GradedReport:
         if isinstance(report, ResultsError):
             made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
@@ -90,7 +90,7 @@ class Flight:
         results = copy.deepcopy(self.honest.results)
         results["student"]["notes"] = text
         return self.graded(
-            read_again(results), Verdict("verified", (), True, page_status="same"), rubric
+            read_again(results), Verification("verified", (), True, page_status="same"), rubric
         )
 
 
@@ -329,7 +329,7 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
-    verdict = Verdict("verified", (), True, page_status="same")
+    verdict = Verification("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
     return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.instructor_action)

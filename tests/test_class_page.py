@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.classroom.grading.outputs import anonymise_entry
 from px4fuse.html.safe import MAX_TEXT_LENGTH
 from px4fuse.results.answer_form import Answers, StudentMistake
-from px4fuse.verification.model import Mismatch, PageDifference, Verdict
+from px4fuse.verification.model import Mismatch, PageDifference, Verification
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
@@ -32,8 +32,8 @@ LONG = "W" * 5000
 
 
 def graded(name: str, points: float | None, **more: Any) -> GradedReport:
-    verdict = Verdict(more.pop("status", "verified"), more.pop("reasons", ("All agrees.",)), True,
-                      pages=more.pop("pages", ()))  # fmt: skip
+    status, reasons = more.pop("status", "verified"), more.pop("reasons", ("All agrees.",))
+    verdict = Verification(status, reasons, True, pages=more.pop("pages", ()))
     items = () if points is None else (
         Item("Pages", min(points, 4.0), 4.0, "There."), Item("Notes", points - 4, 16.0, "–")
     )  # fmt: skip
@@ -162,7 +162,7 @@ def test_class_page_shortens_long_text_and_omits_nan() -> None:
     assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_TEXT_LENGTH
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
-    one = GradedReport("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
+    one = GradedReport("a.pdf", "Ada", "1", Verification("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
     assert '["axes.49","1.0","2.0"]' in text
 

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item
 from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
 from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
-VERIFIED = Verdict("verified", (), True)
+VERIFIED = Verification("verified", (), True)
 DANGEROUS = (
     "=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "  =1", "\u00a0=1",
     "\u200b=1", "\ufeff=1", "\uff1d1", "\uff0b1", "\uff0d1", "\uff201", "\ufe661", '"=1', '""=1"',
@@ -38,7 +38,7 @@ def entry(graded: GradedReport, **more) -> Entry:
 def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Entry:
     one = GradedReport(
         submission=text, student=text, student_id=text,
-        verdict=Verdict("cannot verify", (text, text), with_log=False),
+        verdict=Verification("cannot verify", (text, text), with_log=False),
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from exchange import replace
 from msgspec import structs
 
 from px4fuse.batch.changes import compare_numbers, list_changes
-from px4fuse.batch.inputs import DiffInput
+from px4fuse.batch.inputs import InputResults
 from px4fuse.batch.measures import MEASURES, ComparedNumber, collect_numbers
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.aids import AidAxis, AidResult
@@ -51,7 +51,7 @@ def test_diff_lists_numbers_present_in_only_one_input():
 # -- simulated flights -----------------------------------------------------------------------------
 
 
-def flown(seed: int, *mistakes: str, **scenario) -> DiffInput:
+def flown(seed: int, *mistakes: str, **scenario) -> InputResults:
     """Compare a simulated flight, as an input of diff."""
     flight = simulate_flight(Scenario(seed=seed, **scenario), parse(mistakes))
     request = ComparisonRequest(
@@ -61,12 +61,12 @@ def flown(seed: int, *mistakes: str, **scenario) -> DiffInput:
     return as_input(read_results(to_json(found).encode()))
 
 
-def as_input(found: ComparisonResults) -> DiffInput:
-    return DiffInput("f.json", "results", found)
+def as_input(found: ComparisonResults) -> InputResults:
+    return InputResults("f.json", "results", found)
 
 
 @pytest.fixture(scope="module")
-def clean() -> DiffInput:
+def clean() -> InputResults:
     return flown(501)
 
 
@@ -107,7 +107,7 @@ def test_diff_with_larger_ekf2_noise_reports_worse_ekf2_nis(clean):
 # -- verdicts --------------------------------------------------------------------------------------
 
 
-def with_kf(side: DiffInput, **fields) -> DiffInput:
+def with_kf(side: InputResults, **fields) -> InputResults:
     """Replace fields of the KF summary along north in the results."""
     axis = side.results.axes["north"]
     summary = structs.replace(axis.filters["kf"], **fields)
@@ -115,7 +115,7 @@ def with_kf(side: DiffInput, **fields) -> DiffInput:
     return as_input(replace(side.results, axes={**side.results.axes, "north": axis}))
 
 
-def nees(side: DiffInput, value: float) -> DiffInput:
+def nees(side: InputResults, value: float) -> InputResults:
     truth = side.results.axes["north"].filters["kf"].truth
     return with_kf(side, truth=structs.replace(truth, nees_position_mean=value))
 

@@ -27,7 +27,7 @@ from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.classroom.grading.submissions import parse_origin
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import Answers, StudentMistake
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
 DUE = parse_due_time("2026-11-20 12:00:00 +01:00")
 RUBRIC = read_rubric(None)
@@ -132,7 +132,7 @@ def test_class_entry_with_invalid_extension_names_the_student() -> None:
 
 def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
     essay = replace(
-        graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
+        graded_report("", 0.0), version="", verdict=Verification("cannot verify", ("x",), False)
     )
     files = {blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip

@@ -17,8 +17,6 @@ from px4fuse.core.text import format_metres
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
     draw,
-    quarter_rmse,
-    quarters_sentence,
     rpe_growth_sentence,
     unaligned_sentence,
 )
@@ -100,14 +98,6 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     assert f"translation {format_metres(np.linalg.norm(centre))} m" in sentence
     half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
     assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
-
-
-def test_rmse_per_quarter_of_trajectory_equals_closed_form() -> None:
-    score = evaluate_with_error(across(np.linspace(0.0, 4.0, 2001)))
-    ends = np.arange(5.0)  # ∫ x² dx over a quarter
-    expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
-    np.testing.assert_allclose(quarter_rmse(score), expected, rtol=0.01)
-    assert ", ".join(f"{q:.3f}" for q in quarter_rmse(score)) in quarters_sentence(score)
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])

@@ -27,11 +27,11 @@ from px4fuse.cli.outputs import Interrupted
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.core.workers import JobFailure
 from px4fuse.verification import pages
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
-UNKNOWN = Verdict("cannot verify", (), with_log=False)
+UNKNOWN = Verification("cannot verify", (), with_log=False)
 
 
 @pytest.fixture

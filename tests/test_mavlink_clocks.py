@@ -30,7 +30,7 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import Line, fit_least_delay, map_clock
+from px4fuse.readers.mavlink_clocks import ClockLine, fit_least_delay, map_clock
 
 EMPTY = np.zeros(0)
 NO_EXCHANGES = (EMPTY, EMPTY), (EMPTY, EMPTY)
@@ -410,7 +410,7 @@ def test_mavlink_sender_description_states_lost_fraction(tmp_path):
 def map_unix_timestamps(received, *exchanges):
     """Return UNIX timestamps at 10 Hz and their clock map for given receive times."""
     stamps = UNIX_S + 0.1 * np.arange(len(received))
-    line = Line(0.0, 0.0, 1.0, 0.0, 9)
+    line = ClockLine(0.0, 0.0, 1.0, 0.0, 9)
     return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receipt=True)
 
 

@@ -14,7 +14,7 @@ from time_limit import time_limit
 from px4fuse.core import workers
 from px4fuse.core.reading import display_name, max_log_bytes, read_bytes_limited, read_text
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256
 
 SAMPLES = REPOSITORY / "sample_logs"
@@ -95,7 +95,7 @@ def test_file_search_by_sha256_ignores_special_and_huge_files(desk, monkeypatch,
     def verify_nothing(work, reports, **_):
         (report,) = reports
         found.append(work.keywords["logs"][log_sha256(report)])
-        yield 0, Verdict("verified", (), with_log=True, page_status="same")
+        yield 0, Verification("verified", (), with_log=True, page_status="same")
 
     monkeypatch.setattr(workers, "run_bounded", verify_nothing)
     monkeypatch.chdir(desk)

@@ -193,7 +193,6 @@ REFUSED = {
             ("no secret file", "--secret-file none", "cannot be read"),
             ("seed of a class", "--seed 3", "--seed is not available with --assignment"),
             ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
-            ("preview without a secret", "--preview", "requires --secret-file"),
             ("key inside", "--answer f/k.json", "students' folder"),
         )
     },

@@ -29,12 +29,12 @@ from px4fuse.findings import TITLES
 from px4fuse.results.answer_form import Answers, StudentMistake
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent
-VERIFIED = Verdict("verified", ("all 900 numbers agree",), with_log=True)
+VERIFIED = Verification("verified", ("all 900 numbers agree",), with_log=True)
 SHA = SHA256
 NONE = {"what": "it", "reason": "too few of them", "remedy": ""}
 
@@ -232,14 +232,14 @@ class TestForm:
 
 class TestScore:
     def test_report_with_differing_numbers_earns_zero_points(self):
-        verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
+        verdict = Verification("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
         made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.instructor_action == ""
 
     def test_unverified_report_earns_pending_or_no_points(self):
-        verdict = Verdict("other log", ("no log",), False, remedy="Look.")
+        verdict = Verification("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
@@ -318,7 +318,7 @@ class TestFeedback:
         [
             ({"items": assess_results().items, "flags": ("copied",)},
              ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
-            ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
+            ({"verdict": Verification("cannot verify", ("one", "page 3: two"), False)},
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),

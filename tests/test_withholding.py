@@ -22,7 +22,7 @@ from px4fuse.readers.ulog_topics import ASSESSED_KEY
 from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
 SECRET = b"a secret for tests"
 
@@ -129,7 +129,7 @@ def test_grade_flags_answer_form_of_other_log(assigned: Assigned) -> None:
     student = assigned.results.student
     other = replace(student, answers=replace(student.answers, log_sha256="0" * 64))
     results = replace(assigned.results, student=other)
-    report = score_report(results, Verdict("verified", (), True), read_rubric(None), None)
+    report = score_report(results, Verification("verified", (), True), read_rubric(None), None)
     assert report.counted_points is None
     assert "made for another log" in report.pending_reason
     assert report.pending_reason in report.flags

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from px4fuse.batch.inputs import DiffInput, Progress, Results, read_inputs
+from px4fuse.batch.inputs import InputResults, Progress, Results, read_inputs
 from px4fuse.batch.measures import (
     ABSOLUTE_TOLERANCE,
     FILTER_LABELS,
@@ -61,7 +61,7 @@ def diff(
     return list_changes(*read_inputs(Path(a), Path(b), progress))
 
 
-def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
+def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between the results of A and B."""
     findings = tuple(_finding_changes(a.results, b.results))
     return contract.ChangeResults(
@@ -76,7 +76,7 @@ def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     )
 
 
-def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
+def _describe_input(diff_input: InputResults) -> contract.DiffInput:
     log = diff_input.results.log
     return contract.DiffInput(
         given=diff_input.file_name,

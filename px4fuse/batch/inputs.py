@@ -26,7 +26,7 @@ _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source
 
 
 @dataclass(frozen=True)
-class DiffInput:
+class InputResults:
     """Results of the input A or B of ``px4fuse diff``."""
 
     file_name: str
@@ -36,7 +36,7 @@ class DiffInput:
 
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
-) -> tuple[DiffInput, DiffInput]:
+) -> tuple[InputResults, InputResults]:
     """Read the inputs A and B; a log is analysed with the settings of the other input.
 
     Raises
@@ -55,7 +55,7 @@ def read_inputs(
     )
 
 
-def _read_attached(path: Path) -> DiffInput | None:
+def _read_attached(path: Path) -> InputResults | None:
     """Read the results in a report (PDF) or a JSON file; return None for a log."""
     name, head = display_name(path), read_head(path, 64, LogError)
     is_report = head.startswith(b"%PDF-")
@@ -70,10 +70,10 @@ def _read_attached(path: Path) -> DiffInput | None:
             f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "
             "cannot compare. Give a log, or a report or results of px4fuse compare."
         )
-    return DiffInput(name, "report" if is_report else "results", results)
+    return InputResults(name, "report" if is_report else "results", results)
 
 
-def _analyse_log(path: Path, other_input: DiffInput | None, progress: Progress) -> DiffInput:
+def _analyse_log(path: Path, other_input: InputResults | None, progress: Progress) -> InputResults:
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
         is_same = other_input.results.log.sha256 in files_by_sha256([path])
@@ -85,4 +85,4 @@ def _analyse_log(path: Path, other_input: DiffInput | None, progress: Progress) 
     text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)
-    return DiffInput(display_name(path), "log", results)
+    return InputResults(display_name(path), "log", results)

@@ -4,7 +4,6 @@ import gc
 import sys
 import time
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,13 +14,13 @@ from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
 
 FAILED_STATUS = "failed"
-# Values of --scheduler for which px4fuse prints the instructions in NAME.txt
-CLUSTERS = ("slurm", "kubernetes")
 
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@options.output_option("DIR", "Output folder for the table and the results of each log.")
+@options.output_option(
+    "DIR", "Output folder for the table and the results of each log.", required=True
+)
 @click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
 @options.timeout_option
 @click.option(
@@ -34,8 +33,8 @@ CLUSTERS = ("slurm", "kubernetes")
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Address of a running Dask scheduler (tcp://host:8786) whose cluster processes the logs. "
-    "slurm or kubernetes prints instructions to start a cluster.  [default: this computer]",
+    help="Address of a running Dask scheduler (tcp://host:8786) whose cluster processes the logs.  "
+    "[default: this computer]",
 )
 @options.settings_options
 @options.fail_option(
@@ -46,7 +45,7 @@ CLUSTERS = ("slurm", "kubernetes")
 def batch(
     logs: tuple[str, ...],
     *,
-    output: Path | None,
+    output: Path,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
@@ -57,11 +56,6 @@ def batch(
     fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes
     only new and failed logs. After Ctrl-C the results of finished logs are kept.
     """
-    if scheduler in CLUSTERS:
-        click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
-        return
-    if output is None:
-        raise SettingsError("px4fuse batch requires an output folder: -o DIR.")
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.batch.run import run

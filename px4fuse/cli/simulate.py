@@ -42,7 +42,7 @@ MIXED_KIND = "mixed"
 OUTDOOR_KIND: Kind = "outdoor"
 SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
 # Options that require --assignment
-ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
+ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
 # All options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
     "output",
@@ -113,11 +113,6 @@ class WithMistakes(click.Command):
     help="Number of injected faults in each flight of --assignment.  [default: random, 0 to 2]",
 )
 @click.option(
-    "--preview",
-    is_flag=True,
-    help="Print the flights that --assignment draws, and write no files.",
-)
-@click.option(
     "--kind",
     type=Choice((*get_args(Kind), MIXED_KIND)),
     default=_DEFAULT_SCENARIO.kind,
@@ -171,7 +166,6 @@ def simulate(
     answer: Path | None,
     no_truth: bool,
     no_ekf2: bool,
-    preview: bool,
     kind: Literal[Kind, "mixed"],
     seed: int,
     passes: int | None,
@@ -192,9 +186,7 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         random_choices = _read_secret(secret_file), cast("FlightKind", kind), mistakes
-        _write_assignment(
-            assignment, output, answer, *random_choices, truth=not no_truth, preview=preview
-        )
+        _write_assignment(assignment, output, answer, *random_choices, truth=not no_truth)
         return
     if kind == MIXED_KIND:
         raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
@@ -265,9 +257,8 @@ def _write_assignment(
     count: int | None,
     *,
     truth: bool,
-    preview: bool,
 ) -> None:
-    """Write one flight per student and the answer key, or only print the flights (``preview``)."""
+    """Write one flight per student and the answer key."""
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.random_assignment import (
         EASIEST_DIFFICULTY,
@@ -276,68 +267,39 @@ def _write_assignment(
     from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.report.page import Page
 
-    students, page, closing_texts = read_roster(roster), Page(), dict[str, str]()
+    students, page = read_roster(roster), Page()
     key_file = assignment.key_path(folder, answer_path)
     check_targets([key_file])
     check_output_folder(folder)
-    drawn_flights: list[tuple[tuple[str, ...], float | None]]
-    if preview:
-        previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(flight.mistake_options, flight.difficulty) for flight in previews]
-        rows = [
-            (
-                student.student_id,
-                student.name,
-                flight.scenario.kind,
-                " ".join(flight.mistake_options) or "none",
-                f"{flight.difficulty:.2f}",
-            )
-            for student, flight in zip(students, previews, strict=True)
-        ]
-        page.table(
-            ("student", "name", "flight", "injected faults", "difficulty"),
-            rows,
-            right_aligned_columns=(4,),
+    with progress() as show_progress:
+        show_flight = partial(show_progress, "simulating")
+        key, written_files = assignment.assign(
+            students, folder, key_file, secret, kind, count, truth, show_flight
         )
-        closing_texts["Preview"] = (
-            "no file was written. Do not show the table to students: it lists the injected faults."
-        )
-    else:
-        with progress() as show_progress:
-            show_flight = partial(show_progress, "simulating")
-            key, written_files = assignment.assign(
-                students, folder, key_file, secret, kind, count, truth, show_flight
-            )
-        drawn_flights = [(answer.mistakes, answer.difficulty) for answer in key.answers]
-        folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
-        existing_count = len(drawn_flights) - written_files
-        closing_texts["Flights"] = (
-            f"{folder_text} ({written_files} logs written, {existing_count} existed already)"
-        )
-        closing_texts["Answers"] = (
-            f"{key_text} (not for students: the file lists the injected faults)"
-        )
-        if key.secret:
-            closing_texts["Secret"] = (
-                "a new secret is stored in the answer key. Use --secret-file to write the same "
-                "flights again, or to add students."
-            )
     counts = Counter(
         mistake.partition("=")[0]
-        for mistake_options, _ in drawn_flights
-        for mistake in mistake_options or ("none",)
+        for answer in key.answers
+        for mistake in answer.mistakes or ("none",)
     )
-    difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
-    page.write_labelled_texts(
-        {
-            "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
-            "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-            "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-            f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
-            "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
-            **closing_texts,
-        }
-    )
+    difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
+    folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
+    flight_count = len(key.answers)
+    texts = {
+        "Class": f"{flight_count} student{'s' * (flight_count != 1)}, {kind}",
+        "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+        "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
+        f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
+        "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
+        "Flights": f"{folder_text} ({written_files} logs written, {flight_count - written_files} "
+        "existed already)",
+        "Answers": f"{key_text} (not for students: the file lists the injected faults)",
+    }
+    if key.secret:
+        texts["Secret"] = (
+            "a new secret is stored in the answer key. Use --secret-file to write the same "
+            "flights again, or to add students."
+        )
+    page.write_labelled_texts(texts)
     write_and_print({}, page)
 
 

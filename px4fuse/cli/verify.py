@@ -18,7 +18,7 @@ from px4fuse.errors import LogError
 
 if TYPE_CHECKING:
     from px4fuse.report.page import Page
-    from px4fuse.verification.model import Verdict
+    from px4fuse.verification.model import Verification
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 # Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
@@ -70,7 +70,7 @@ def verify(
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
-def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
+def _verdict_data(pdf: bytes, verdict: Verification) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT_NOTE
 
     values = asdict(verdict)
@@ -85,7 +85,7 @@ def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
     }
 
 
-def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
+def _page(name: str, verdict: Verification, output: Path | None) -> Page:
     from px4fuse.core.text import one_line
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS

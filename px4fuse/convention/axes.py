@@ -115,7 +115,7 @@ FAMILIES = tuple(
 
 
 @dataclass(frozen=True)
-class Positions:
+class SentPositions:
     """Positions of a source as sent, and barometer times (s) and heights (m)."""
 
     time_s: Array
@@ -123,7 +123,7 @@ class Positions:
     max_offset_s: float
     barometer: tuple[Array, Array] | None = None
 
-    def with_clock_drift(self, drift: float) -> "Positions":
+    def with_clock_drift(self, drift: float) -> "SentPositions":
         return replace(self, time_s=without_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
@@ -198,7 +198,9 @@ def without_drift(time_s: Array, drift: float) -> Array:
     return middle + (time_s - middle) / (1.0 + drift)
 
 
-def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
+def search(
+    positions: SentPositions, motions: Mapping[HeadingSource, ImuMotion]
+) -> list[Hypothesis]:
     """Return all likely conventions of the positions, best first.
 
     Empty without motion, or if positions and IMU data overlap for less than ``MIN_OVERLAP_S``.
@@ -271,7 +273,7 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
 
 
 def refine(
-    start: Hypothesis, positions: Positions, source: SourceMotion, imu: ImuMotion
+    start: Hypothesis, positions: SentPositions, source: SourceMotion, imu: ImuMotion
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source.is_valid)
@@ -366,7 +368,7 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
     return float(score), float(np.sqrt(variance))
 
 
-def _log_odds(hypothesis: Hypothesis, positions: Positions) -> float:
+def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the log prior odds of a hypothesis, plus the log likelihood of its heights."""
     log_odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
     log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)

@@ -10,7 +10,7 @@ from px4fuse.convention.axes import (
     SMALL_ROTATION,
     UNITS,
     Hypothesis,
-    Positions,
+    SentPositions,
     find_candidates,
     refine,
     search,
@@ -104,7 +104,7 @@ def check_convention(
     return structs.replace(convention, orientation=orientation)
 
 
-def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
+def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> SentPositions:
     """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
     if samples["down_m"].notna().mean() < MIN_HEIGHT_FRACTION:
@@ -116,10 +116,10 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     heights = None
     if barometer is not None:
         heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
-    return Positions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
+    return SentPositions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
 
 
-def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
+def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
     """Return the likely conventions, best first; the logged heading is preferred."""
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
@@ -133,7 +133,7 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
     return hypotheses
 
 
-def _decide(hypotheses: list[Hypothesis], positions: Positions, drift: float) -> Convention:
+def _decide(hypotheses: list[Hypothesis], positions: SentPositions, drift: float) -> Convention:
     """Decide whether the best convention is unambiguous and its residuals are plausible."""
     best = hypotheses[0]
     rivals = [hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best)]
@@ -185,7 +185,7 @@ def _describe(hypothesis: Hypothesis) -> str:
     return f"{axes}{rotation}, timestamps {hypothesis.offset_s:+.1f} s late"
 
 
-def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
+def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the ratio of the residuals to the noise of source and IMU.
 
     The noise of the source is from third differences of the positions, which contain hardly any
@@ -199,7 +199,7 @@ def residual_ratio(hypothesis: Hypothesis, positions: Positions) -> float:
     return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
 
-def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
+def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
     start_drift = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
@@ -219,7 +219,7 @@ def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> floa
 def _check_orientation(
     inertial: Inertial,
     track: PositionTrack,
-    positions: Positions,
+    positions: SentPositions,
     best: Hypothesis,
     verdict: Verdict,
 ) -> OrientationConvention | None:

@@ -43,7 +43,7 @@ MAX_REGULAR_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True)
-class Line:
+class ClockLine:
     """Linear map between two clocks: y = y0 + slope · (x - x0).
 
     ``pairs`` is the number of simultaneous readings of both clocks. ``jitter`` (unit of y) is their
@@ -60,12 +60,12 @@ class Line:
         """Return the readings y of the second clock at readings x of the first."""
         return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
 
-    def inverse(self) -> Line:
+    def inverse(self) -> ClockLine:
         """Return the inverse map, from y to x."""
-        return Line(self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pairs)
+        return ClockLine(self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pairs)
 
 
-def fit_least_delay(x: Array, y: Array) -> Line:
+def fit_least_delay(x: Array, y: Array) -> ClockLine:
     """Fit a line to pairs of clock readings (s) with the least delay: y is read later than x.
 
     The slope is 1 if the span is too short to estimate a drift.
@@ -93,7 +93,9 @@ def fit_least_delay(x: Array, y: Array) -> Line:
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
             residual = y - slope * (x - x0)
             envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
-    return Line(x0, float(np.median(residual[envelope_rows])), slope, robust_std(residual), len(x))
+    return ClockLine(
+        x0, float(np.median(residual[envelope_rows])), slope, robust_std(residual), len(x)
+    )
 
 
 def _median_slope(x: Array, y: Array) -> float:
@@ -123,7 +125,7 @@ class ClockMapping:
     ``to_boot`` is None if most timestamps are equal; the receive time is then used instead.
     """
 
-    to_boot: Line | None
+    to_boot: ClockLine | None
     description: ClockMap
 
 
@@ -131,10 +133,10 @@ def map_clock(
     name: str,
     stamp_s: Array,
     received_s: Array,
-    boot_of_receipt: Line,
+    boot_of_receipt: ClockLine,
     replies: tuple[Array, Array],
     answers: tuple[Array, Array],
-    map_boot_to_unix: Line | None,
+    map_boot_to_unix: ClockLine | None,
     *,
     has_receipt: bool,
 ) -> ClockMapping:
@@ -142,13 +144,13 @@ def map_clock(
 
     Parameters
     ----------
-    boot_of_receipt : Line
+    boot_of_receipt : ClockLine
         Map from receive time to boot clock.
     replies : tuple of ndarray
         Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
     answers : tuple of ndarray
         Times (s) of the sender's TIMESYNC requests, and of the autopilot's replies.
-    map_boot_to_unix : Line or None
+    map_boot_to_unix : ClockLine or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
         False if the recording contains only the order of the messages, no receive times.
@@ -184,7 +186,7 @@ def map_clock(
         unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
-        line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
+        line = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "the timestamps of the sender are boot times of the autopilot"
         return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
     clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
@@ -204,7 +206,7 @@ def map_clock(
     return ClockMapping(line, _clock_map(clock_name, time_source, line, stamp_s, note))
 
 
-def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
+def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> ClockLine | None:
     """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions."""
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
@@ -218,10 +220,10 @@ def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) ->
     x0 = lines[0].x0
     line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
     y0, slope, jitter = np.mean(line_values, axis=0).tolist()
-    return Line(x0, y0, slope, jitter, sum(line.pairs for line in lines))
+    return ClockLine(x0, y0, slope, jitter, sum(line.pairs for line in lines))
 
 
-def _clock_map(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
+def _clock_map(clock: str, method: str, line: ClockLine, stamp_s: Array, note: str) -> ClockMap:
     middle_s = float(0.5 * (stamp_s.min() + stamp_s.max()))
     offset_s = float(line.at(middle_s)) - middle_s
     drift_ppm = (line.slope - 1.0) * 1e6

@@ -13,7 +13,12 @@ from px4fuse.flight.log import Stream
 from px4fuse.flight.model import Columns, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
-from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S, Line, fit_least_delay, is_running_clock
+from px4fuse.readers.mavlink_clocks import (
+    MIN_UNIX_TIME_S,
+    ClockLine,
+    fit_least_delay,
+    is_running_clock,
+)
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
     Address,
@@ -54,7 +59,7 @@ class Recording:
     # of the last autopilot message before the frame
     received_s: Array
     # Map from receive time to boot clock
-    boot_of_receipt: Line
+    boot_of_receipt: ClockLine
     # Boot time at the start of the session, which is time zero of the flight
     zero_s: float
     duration_s: float
@@ -264,7 +269,7 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
     rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
-    line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
+    line = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     received_s = np.zeros(len(frames))
     if frames.received_us is not None:
         received_s = (frames.received_us - frames.received_us[0]) * 1e-6
@@ -324,7 +329,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
     return np.concatenate(groups[large_groups[0] : large_groups[-1] + 1])
 
 
-def map_boot_to_unix(recording: Recording) -> Line | None:
+def map_boot_to_unix(recording: Recording) -> ClockLine | None:
     """Map the boot clock to UNIX time by SYSTEM_TIME, if it contains UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     boot_s = table["time_boot_ms"] * 1e-3

@@ -12,8 +12,8 @@ from px4fuse.flight.log import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
     MAX_RATE_DIFFERENCE,
+    ClockLine,
     ClockMapping,
-    Line,
     is_running_clock,
     map_clock,
 )
@@ -117,7 +117,7 @@ def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
 
 
 def _map_sender_clock(
-    recording: Recording, sender: Address, unix_line: Line | None
+    recording: Recording, sender: Address, unix_line: ClockLine | None
 ) -> ClockMapping:
     frames = recording.frames
     timestamps_s = []

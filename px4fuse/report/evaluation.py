@@ -122,7 +122,6 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     page.legend(axes.get_legend_handles_labels()[0])
     axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
-    right.write_small(quarters_sentence(evaluation))
     page.add_columns(left, right)
     if _rpe_statistics(evaluation):
         left, right = halves()
@@ -259,23 +258,6 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
         f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
         f"{scale_text} (difference of the frames, not an error)."
-    )
-
-
-def quarter_rmse(evaluation: Evaluation) -> list[float]:
-    """Return the RMSE (m) of each quarter of the path that contains poses."""
-    distance_m = evaluation.distance_m
-    edges = np.linspace(0.0, distance_m[-1], 5)
-    quarter_index = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, 3)
-    errors = [evaluation.position_error_m[quarter_index == index] for index in range(4)]
-    return [float(np.sqrt(np.mean(e**2))) for e in errors if len(e)]
-
-
-def quarters_sentence(evaluation: Evaluation) -> str:
-    rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
-    return (
-        f"RMSE per quarter of the path: {rmse_text} m. An error by drift grows along the path; "
-        "after alignment it is large at both ends."
     )
 
 

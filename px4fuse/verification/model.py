@@ -48,7 +48,7 @@ class PageDifference:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verification:
     """Result of verifying a report against its log.
 
     Attributes

@@ -32,7 +32,7 @@ from px4fuse.results.contract import (
     to_plain,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
-from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
+from px4fuse.verification.model import Mismatch, PageStatus, Status, Verification
 from px4fuse.verification.pages import TextComparison, compare_pages
 
 ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
@@ -104,7 +104,7 @@ def log_name(results: ReportedResults) -> str:
     return results.log.name
 
 
-def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
+def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verification:
     """Repeat the analysis of a report on the files in ``logs`` (by SHA-256).
 
     Return the verdict "cannot verify" if the recorded command is not possible, a file is missing,
@@ -219,8 +219,10 @@ def verify(
     pdf: bytes,
     logs: Mapping[str, Path],
     *,
-    recompute: Callable[[ReportedResults, Mapping[str, Path]], Recomputed | Verdict] = recompute,
-) -> Verdict:
+    recompute: Callable[
+        [ReportedResults, Mapping[str, Path]], Recomputed | Verification
+    ] = recompute,
+) -> Verification:
     """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters
@@ -247,20 +249,20 @@ def verify(
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {name} to --logs."
-        return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
+        return Verification("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_ADVICE)
     new_results = recompute(results, logs)
-    if isinstance(new_results, Verdict):
+    if isinstance(new_results, Verification):
         return new_results
     return _verify_with_log(results, pdf, *new_results)
 
 
-def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verdict:
+def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
     """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
     reasons = (one_line(reason, 400),)
-    return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
+    return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
 
 def _verify_with_log(
@@ -268,11 +270,11 @@ def _verify_with_log(
     pdf: bytes,
     new_results: ReportedResults,
     draw: Callable[[], bytes],
-) -> Verdict:
+) -> Verification:
     redrawn_pdf = draw()
     if redrawn_pdf == pdf:
         reason = "a new run on the log gives an identical PDF"
-        return Verdict(
+        return Verification(
             "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
         )
     mismatches, is_same_number, value_count = compare_results(
@@ -318,7 +320,7 @@ def _verify_with_log(
         remedy = remedy or f"Verify the report with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
     listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
-    return Verdict(
+    return Verification(
         status, tuple(reasons), True, listed_mismatches, page_status, pages, redrawn_pdf, remedy
     )
 

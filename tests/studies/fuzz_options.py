@@ -135,7 +135,7 @@ NEEDS = {
         ("position_frame", "position_yaw", "position_columns", "position_time_unit",
          "position_unit"), "position",
     ),
-    **dict.fromkeys(("secret_file", "mistakes", "preview"), "assignment"),
+    **dict.fromkeys(("secret_file", "mistakes"), "assignment"),
     "since": "without", "column": "worksheet", "late": "due",
 }  # fmt: skip
 # Options that exclude each other
@@ -200,7 +200,7 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
     chosen = set(rng.sample(sorted(options), min(rng.randrange(6), len(options))))
     chosen |= {NEEDS[one] for one in chosen if one in NEEDS}
     if "assignment" in chosen:
-        chosen &= {"assignment", "secret_file", "mistakes", "preview", "no_truth", "answer"}
+        chosen &= {"assignment", "secret_file", "mistakes", "no_truth", "answer"}
     if arguments == "g.g2o":
         chosen &= {"g2o", "json_path", "robust"}
     if arguments not in ("", "aisle.ulg"):  # the position file is of this flight

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
-    AssignedFlight,
     FlightKind,
     derive_key,
     draw,
@@ -22,7 +21,7 @@ from px4fuse.classroom.assignment.truth import draw_predictions, form_truth
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
@@ -152,31 +151,6 @@ def assign(
         written_count += folder / student.file in missing_contents
         progress(finished_count, len(students))
     return key, written_count
-
-
-def preview(
-    students: Sequence[Person],
-    key_file: Path,
-    secret: bytes | None,
-    kind: FlightKind,
-    count: int | None = None,
-) -> list[AssignedFlight]:
-    """Draw the flights that :func:`assign` would simulate, without writing files.
-
-    Raises
-    ------
-    SettingsError
-        One flight cannot have this many injected faults, or no secret was given or stored.
-    """
-    if secret is None:
-        stored_key = read_key(key_file) if key_file.exists() else None
-        if stored_key is None or not stored_key.secret:
-            raise SettingsError(
-                "--preview requires --secret-file: --preview stores no secret, so the next run "
-                "would draw other flights."
-            )
-        secret = derive_key(stored_key.secret)
-    return [draw(secret, student.student_id, kind, count) for student in students]
 
 
 def _is_written(path: Path, content: bytes) -> bool:

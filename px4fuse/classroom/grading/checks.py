@@ -32,7 +32,7 @@ from px4fuse.results.contract import (
     to_plain,
 )
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE_LENGTH = 160
@@ -109,7 +109,7 @@ class CheckInput:
     """
 
     results: ReportedResults
-    verdict: Verdict
+    verdict: Verification
     key: AnswerKey | None
     submitter_id: str = ""
 

@@ -17,7 +17,7 @@ from px4fuse.core.text import capitalise_first, join_first, one_line
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
 # Minimum number of equal numbers in two answer forms for flagging them as copies
 MIN_SAME_NUMBERS = 3
@@ -32,7 +32,7 @@ MAX_LISTED_REPORTS = 4
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
-def flag_pages(verdict: Verdict) -> Iterator[str]:
+def flag_pages(verdict: Verification) -> Iterator[str]:
     """Yield a flag with the first difference if a PDF differs from the redrawn report."""
     if verdict.pages:
         first_page, *further_pages = verdict.pages
@@ -112,7 +112,7 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
     """Count the equal numbers of two answer forms, without numbers of one digit.
 
-    SAME_NUMBER_TOLERANCE is not used for the values of corrections and lists, which must be equal.
+    Values of corrections and lists must be exactly equal, others within SAME_NUMBER_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1

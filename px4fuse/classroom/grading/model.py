@@ -7,7 +7,7 @@ from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.results.answer_form import Answers
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 
 # Title of the sum over all rubric items, in overrides.csv and messages
 TOTAL_TITLE = "total"
@@ -110,7 +110,7 @@ class GradedReport:
     submission: str
     student: str
     student_id: str
-    verdict: Verdict
+    verdict: Verification
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
     instructor_action: str = ""

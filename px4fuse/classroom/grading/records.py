@@ -19,7 +19,7 @@ from px4fuse.readers.ulog_topics import ignores_assessed
 from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, recompute, verify
 
@@ -40,12 +40,12 @@ class VerificationRecord:
 
     dependencies: dict[str, str]
     results: str
-    verdict: Verdict
+    verdict: Verification
 
 
 def load_or_verify(
     records: Path, pdf: bytes, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
-) -> tuple[ReportedResults, Verdict, bool]:
+) -> tuple[ReportedResults, Verification, bool]:
     """Read and verify a report, or load its stored verification.
 
     Parameters
@@ -64,7 +64,7 @@ def load_or_verify(
     results : ComparisonResults or LoopResults
         Results attached to the PDF; for a verified report on an assigned log, the results with
         px4fuse's diagnosis.
-    verdict : Verdict
+    verdict : Verification
     is_loaded : bool
         True if a stored verification was loaded.
 
@@ -99,7 +99,7 @@ def diagnose_assigned(
         outcome = recompute(results, logs)
     finally:
         ignores_assessed.reset(token)
-    if isinstance(outcome, Verdict):
+    if isinstance(outcome, Verification):
         raise ResultsError(f"The diagnosis for the feedback failed: {'; '.join(outcome.reasons)}.")
     diagnosed_results, draw = outcome
     return structs.replace(diagnosed_results, provenance=results.provenance), draw()
@@ -134,7 +134,7 @@ def _write_record(
 
 def _load_record(
     records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
-) -> tuple[ReportedResults, Verdict] | None:
+) -> tuple[ReportedResults, Verification] | None:
     """Load a stored verification; None if there is none, or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()

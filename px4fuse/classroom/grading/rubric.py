@@ -33,7 +33,7 @@ from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import Answers
 from px4fuse.results.contract import LoopResults, ReportedResults
-from px4fuse.verification.model import Verdict
+from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import cannot_verify, log_sha256
 
 DEFAULT_NAME = "rubric.toml"
@@ -132,7 +132,7 @@ OTHER_FORM_ADVICE = (
 
 def score_report(
     results: ReportedResults,
-    verdict: Verdict,
+    verdict: Verification,
     rubric: Rubric,
     key: AnswerKey | None,
     submitter_id: str = "",
