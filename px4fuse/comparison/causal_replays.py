@@ -94,7 +94,7 @@ def error_above_reported_sigma(
 ) -> ErrorAboveSigma | None:
     """Return the position error of a filter if it exceeds the reported σ and the NIS is normal.
 
-    A filter without innovations along the axis has no NIS, which also hides the error.
+    A filter without innovations along the axis has no NIS, which counts as normal.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
@@ -251,7 +251,7 @@ def _try_changes(
 
 
 def _flown_statistics(tested_filter: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter as flown, and True if they are from the log or from KF."""
+    """Return the statistics of a filter as flown, and False if they are from EKF2's replay."""
     replayed_statistics, logged_state = tested_filter.rerun(result, {}), result.ekf2_state
     if tested_filter.model is None:
         return replayed_statistics, True

@@ -257,8 +257,8 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    For each window, the mean of the two windows after it is compared with all windows before it.
-    The change begins in the window itself if that mean already shows a third of the change.
+    For each window, the mean of the two windows after it is compared with the mean before it. The
+    change begins in the window itself if its own mean has changed by a third of that.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     windows = pd.Series(normalised).groupby(window).agg(["mean", "size"])

@@ -41,7 +41,7 @@ MAX_LATENESS_S = 0.1
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Columns of the effects on the state at the end of an interval: initial attitude error, gyro bias,
+# Causes of a change of the state in an interval, as columns: initial attitude error, gyro bias,
 # accelerometer bias (3 each), correction of the nominal attitude, acceleration
 EFFECT_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
@@ -184,7 +184,10 @@ def _actions(
 
 
 def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the effects on attitude, velocity and position, shape (E, 9, EFFECT_COLUMN_COUNT)."""
+    """Return the effect of each cause on attitude, velocity and position at the end of an interval.
+
+    Shape (E, 9, EFFECT_COLUMN_COUNT), with one column per cause.
+    """
     length = end - start
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
@@ -217,9 +220,9 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
     """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
 
-    Sum over n steps d, with the mean specific force of the interval. Each step adds d² to the
-    variance of attitude or velocity. For velocity and position, only the leading terms of the gyro
-    noise are used.
+    The noise is summed over the prediction steps: a step of length d adds d² to the variance of
+    attitude or velocity. The specific force is the mean of the interval. For velocity and position,
+    only the leading terms of the gyro noise are used.
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n

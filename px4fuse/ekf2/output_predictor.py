@@ -25,7 +25,7 @@ from px4fuse.trajectory.rotation import rotate
 
 # Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Gain of the correction of the published attitude per fusion horizon delay (output_predictor.cpp)
+# Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 

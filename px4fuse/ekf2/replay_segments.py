@@ -352,7 +352,7 @@ def _make_gnss_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    """Make a segment with earth rotation, EKF2's internal metres and bad accelerations."""
+    """Make a segment with earth rotation, positions in EKF2's metres, and bad accelerations."""
     segment = _make_segment(imu, attitude, ekf2, record, start_row, end_s)
     metres_per_metre = ekf2_metres_per_metre(record)
     state = segment.state.copy()
