@@ -254,10 +254,7 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         assert page.ask("document.getElementById('quiz-solution').hidden")
         if number == 0:
             page.click("#quiz-check")
-            assert (
-                element_text(page, "quiz-message")
-                == "Select at least one mistake, or “no mistake”."
-            )
+            assert element_text(page, "quiz-message") == "Select at least one fault, or “no fault”."
         right = number % 3 != 1
         wrong = next(name for name in FAULT_CHOICES if name not in key["right"])
         choose(page, *(key["right"] if right else [wrong]))

@@ -40,7 +40,7 @@ const Practice = (() => {
     $("quiz-check").hidden = !isOpen;
     onClick("quiz-check", () => {
       const chosen = boxes.filter(({ checked }) => checked).map(({ value }) => value);
-      if (!chosen.length) { $("quiz-message").textContent = "Select at least one mistake, or “no mistake”."; return; }
+      if (!chosen.length) { $("quiz-message").textContent = "Select at least one fault, or “no fault”."; return; }
       answers[current] = chosen.sort().join(" ");
       goTo(current);
     });

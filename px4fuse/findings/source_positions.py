@@ -67,7 +67,7 @@ MIN_UNANNOUNCED_JUMPS = 3
 MIN_SMALL_JUMP_M = 0.1
 # Minimum ratio of a jump without a change of reset_counter to the median change between steps
 MIN_STEP_RATIO = 8.0
-# Number of step differences in the running median
+# Number of position changes in this median
 NOISE_SAMPLES = 61
 # Minimum number of positions for the detection of jumps
 MIN_JUMP_ROWS = 100
@@ -138,7 +138,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     clock, correlation = analysis.clock, analysis.time_correlated_noise
-    # at a high rate the correlation gives an inaccurate lag; the time offset contains the lag
+    # at a high rate, the time offset determines the lag better than the correlation does
     limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
     if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
