@@ -21,7 +21,7 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans, rms_to_truth
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -189,7 +189,7 @@ def explain_by_steps(
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
-                [along(track, columns, direction, times) for columns in TRACK_COLUMNS]
+                [component_along(track, columns, direction, times) for columns in TRACK_COLUMNS]
                 for direction in directions.values()
             ]
         )

@@ -21,7 +21,8 @@ MIN_LATENCY_S = 0.02
 MIN_LATENCY_ERROR_S = 0.10
 # Minimum number of positions before, and after, the time at which TIMESYNC converged
 MIN_SAMPLES = 10
-# Minimum fraction of arrival times before, and of measurement times after, that time
+# Minimum fraction of timestamps that are arrival times before TIMESYNC converged, and measurement
+# times after it
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst
 MIN_BURST = 2.5
