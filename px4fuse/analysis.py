@@ -51,7 +51,7 @@ class Analysis(Comparison, Estimates, Reruns):
 
     @property
     def main_trials(self) -> list[Trial]:
-        """Re-runs along the main axis; of EKF2 only if its replay agrees with the log."""
+        """Re-runs along the main axis, without an EKF2 replay that differs from the log."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 

@@ -104,7 +104,7 @@ def diagnose(
 def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Explain a comparison: estimate errors, re-run the filters without each error, find faults.
 
-    Of a flight that is an assignment, only the comparison is returned.
+    For a flight that is an assignment, the result contains only the comparison.
     """
     if comparison.flight.log.is_assessed:
         return Analysis(
@@ -291,7 +291,7 @@ def run_what_if(
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
             prepared = prepare(flight, recordings)
             comparison = compare(prepared, run_kf(prepared))
-    except MissingDataError:  # given changes need no estimates
+    except MissingDataError:  # changes that the user gave need no estimates
         if is_default_change:
             raise
     if comparison is not None:

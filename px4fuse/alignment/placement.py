@@ -37,9 +37,9 @@ MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
-# Minimum rotation (°) of the frame of a position file to be named
+# Minimum rotation (°) of the frame of a position file for a message
 MIN_NAMED_YAW_DEG = 1.0
-# Minimum distance (m) of the origin of a position file from EKF2's origin to be named
+# Minimum distance (m) of the origin of a position file from EKF2's origin for a message
 MIN_NAMED_SHIFT_M = 1.0
 
 

@@ -218,7 +218,7 @@ def white_noise_m(position_m: Array) -> float:
 
 
 def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
-    """Return "uwb" for noisy positions at a low rate; else the sensor is "unknown".
+    """Return "uwb" for noisy positions at a low rate, else "unknown".
 
     Motion capture, odometry and other precise systems may also send positions only.
     """

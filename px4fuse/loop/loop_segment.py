@@ -104,7 +104,7 @@ def choose_loop_segment(
         )
     inside_s = max(low_s, span_s[0]), min(high_s, span_s[1])
     if inside_s != (low_s, high_s) and inside_s[0] < inside_s[1]:
-        reason, (low_s, high_s) = f"{reason}, as far as the track has poses", inside_s
+        reason, (low_s, high_s) = f"{reason}, limited to the times with poses", inside_s
     return Segment(low_s, high_s, reason, flight_s), rests_at_ends
 
 

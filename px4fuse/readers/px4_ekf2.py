@@ -40,8 +40,8 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance of a number of IMU samples per prediction from n + 0.5, for which EKF2 may round
-# up or down
+# Maximum distance from n + 0.5 of the ratio of prediction interval to IMU interval, for which EKF2
+# may round up or down
 MAX_HALF_DISTANCE = 0.05
 # Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
 # between them
@@ -386,7 +386,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Undo EKF2's low-pass filter of optical flow; return weighted means between two rows."""
+    """Undo EKF2's low-pass filter of optical flow; return the mean of each interval."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")

@@ -245,7 +245,7 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
         (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
-    # At index k the first sample of sparse is at sample k - (n - 1) of dense
+    # The n sparse samples begin at the dense sample k - (n - 1) for the correlation with index k
     lags_s = (
         (peak_indices - (len(is_known_sparse) - 1)) * step_s
         + float(dense_track.time_s[0])
