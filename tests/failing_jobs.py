@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from typing import Any
 
@@ -22,6 +23,8 @@ def run_job(job: tuple[str, Any]) -> Any:
     match what:
         case "square":
             return value * value
+        case "blocks Ctrl-C":
+            return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
         case "exit":
             os._exit(value)
         case "hang":

@@ -391,12 +391,14 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     import fsspec
 
     monkeypatch.chdir(tmp_path)
-    for name in ("logs/b.ulg", "logs/deep/a.TLOG", "logs/c.txt", "logs/d[1].ulg", "named"):
+    for name in ("logs/b.ulg", "logs/deep/a.TLOG", "logs/c.txt", "logs/d[1].ulg", "logs/e.ULG.gz",
+                 "named"):  # fmt: skip
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"12345")
     assert [(log.name, log.log) for log in find_logs(["logs"])] == [
         ("a.TLOG", "logs/deep/a.TLOG"), ("b.ulg", "logs/b.ulg"), ("d[1].ulg", "logs/d[1].ulg"),
+        ("e.ULG.gz", "logs/e.ULG.gz"),
     ]  # fmt: skip
     # each log once; a file that is given by its name may have any suffix
     again = find_logs(["logs/*.ulg", str(tmp_path / "logs/b.ulg"), "logs/d[1].ulg", "named"])

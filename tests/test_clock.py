@@ -442,8 +442,8 @@ def stated(
     ],
 )
 def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
-    assert with_orientation(origin, turns=True).may_drift is drifts
-    assert not with_orientation(origin, turns=False).may_drift
+    assert with_orientation(origin, is_changing=True).may_drift is drifts
+    assert not with_orientation(origin, is_changing=False).may_drift
 
 
 def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
@@ -468,5 +468,5 @@ def test_time_offset_with_too_wide_interval_is_undetermined() -> None:
     assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
     assert not wide.is_determinable
-    assert "as with a drifting source" in wide.reason
+    assert "probably because the source drifts" in wide.reason
     assert widen_for_drift(stated(0.0, 0.3)).change_p_value is None  # two parts give no scatter

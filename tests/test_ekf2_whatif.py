@@ -16,7 +16,7 @@ from msgspec import structs
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
+from px4fuse.ekf2.replay import Ekf2Replay, component_along, rms_to_truth
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
     ATTITUDE,
@@ -174,7 +174,7 @@ def test_rmse_against_ground_truth_uses_only_common_times():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
-    there = along(truth.samples, ["north_m", "east_m"], direction, times)
+    there = component_along(truth.samples, ["north_m", "east_m"], direction, times)
     assert there == pytest.approx([1.6, 1.6, 2.2, 2.8, 2.8])
     off, flight = np.array([9.0, 3.0, 4.0, 5.0, 9.0]), made(Flight, truth=truth)
     error = rms_to_truth(flight, there + off, direction, times)

@@ -201,6 +201,13 @@ def test_pose_association_interpolates_motion_but_not_gaps() -> None:
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
+def test_sparse_reference_is_paired_and_not_interpolated() -> None:
+    reference, estimate = flight(80.0, 0.1), flight(80.0, 5.0)
+    estimate_poses, reference_poses, got = associate(estimate, reference)
+    assert (got.method, got.poses) == ("nearest", len(reference))
+    np.testing.assert_allclose(estimate_poses.time_s, reference_poses.time_s, atol=0.2)
+
+
 @pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
 def test_nearest_pose_association_equals_exhaustive_search(denser: bool) -> None:
     """Poses before, after and in a gap of the reference."""

@@ -316,7 +316,7 @@ def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 2.0}, "measurement noise",
          "Set SIGMA_A to 0.3 m/s² (--sigma-a 0.3) and SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"outliers_left_out": 9.0}, "outliers",
-         "Restore line of sight, or remove the outliers before sending."),
+         "Give the tag line of sight to the anchors, or remove outliers before sending."),
         ("kf", {"outliers_left_out": 9.0, "sigma_z_m": 2.0}, "outliers",
          "before sending. Set SIGMA_Z to 2 m (--sigma-z 2)."),
         ("kf", {"clock_offset_s": -0.25}, "clock",
@@ -375,12 +375,12 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     [
         (fused(0.1), Noise(0.3, 0.2, 0.4), {}, "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
         (fused(0.1), Noise(0.124, 0.12, 0.13), {},
-         "EKF2's measurement noise (0.1 m) is right: check"),
+         "EKF2's measurement noise (0.1 m) fits the position noise"),
         (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {},
-         "EKF2's measurement noise (0.1 m) is right"),
+         "EKF2's measurement noise (0.1 m) fits"),
         # a smaller noise than the sender reports: its variances must not be used
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
-         "Set EKF2_EVP_NOISE to 0.1 m and EKF2_EV_NOISE_MD to 1 (EKF2"),
+         "Set EKF2_EV_NOISE_MD to 1 (EKF2"),
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
          "Set EKF2_EVP_NOISE to 0.1 m (EKF2"),
         # PX4's minimum, and a bound

@@ -253,3 +253,10 @@ def test_tum_file_has_unix_time_and_requires_orientation(tmp_path: Path) -> None
     assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
     with pytest.raises(TrajectoryError, match="has no orientations"):
         tum_text(replace(made, rotation=None))
+
+
+@pytest.mark.parametrize("quaternion", ["0 0 0 0", "nan nan nan nan"])
+def test_trajectory_without_quaternions_has_no_rotation(quaternion, tmp_path) -> None:
+    path = tmp_path / "positions.tum"
+    path.write_text("".join(f"{i} {i} 2 3 {quaternion}\n" for i in range(9)))
+    assert read_trajectory(str(path)).rotation is None

@@ -196,6 +196,6 @@ def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) 
     assert all(NOT_PREDICTABLE not in line[:3] for line in table)
     assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE] * 2
     said = " ".join(sweep_notes(told))
-    assert "Not predictable: more than 35% of the samples would be rejected" in said
-    assert "2 mm of position noise would change the result" in said
+    assert "not predictable if more than 35% of the samples would be rejected" in said
+    assert "2 mm of position noise would change it" in said
     assert "closest to 1" not in said

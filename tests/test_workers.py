@@ -59,6 +59,12 @@ def test_worker_job_that_fails_does_not_affect_other_jobs():
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signal masks")
+def test_worker_process_starts_with_blocked_ctrl_c():
+    assert run([("blocks Ctrl-C", None)])[0] == [True]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
 def test_worker_job_that_hangs_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]

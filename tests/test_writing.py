@@ -165,6 +165,17 @@ def test_write_error_lists_the_files_already_written(tmp_path, monkeypatch) -> N
         write_all({b: b"new"})
 
 
+def test_full_disk_leaves_no_empty_folder(tmp_path, monkeypatch) -> None:
+    def fill() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "new" / "imu.csv"
+    at_rename_to(path, monkeypatch, fill)
+    with pytest.raises(OutputError, match="Free disk space"):
+        write_all({path: b"1"})
+    assert not path.parent.exists()
+
+
 def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")

@@ -39,6 +39,8 @@ MAX_DISTINCT_FRACTION = 0.5
 MAX_UNIX_DIFFERENCE_S = 60.0
 # Minimum rotation (°) of the frame of a position file to be named
 MIN_NAMED_YAW_DEG = 1.0
+# Minimum distance (m) of the origin of a position file from EKF2's origin to be named
+MIN_NAMED_SHIFT_M = 1.0
 
 
 def align_position_file(
@@ -290,21 +292,22 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     name = match.reference.name
     fit = match.free_yaw_fit
     is_rotated = match.is_rotated
-    shift_text = ""
+    shift_text, shift_m = "", 0.0
     if distance_m is not None:
         rms_m = truncated_rms(distance_m) / np.sqrt(2.0)
         is_rotated = matching.is_good_fit(fit, name) and matching.needs_rotation(rms_m, fit, name)
-        shift_m = np.hypot(*fit.origin_m[:2])
+        shift_m = float(np.hypot(*fit.origin_m[:2]))
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    rotation_text = (
+    # GNSS determines EKF2's origin to about 1 m
+    if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG and shift_m < MIN_NAMED_SHIFT_M:
+        return ""
+    return (
         f"The frame of the position file is rotated by {yaw_deg:.1f}° against the {name}. "
+        f"{shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
-    if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG:
-        rotation_text = ""
-    return f"{rotation_text}{shift_text}Give --position-yaw auto to estimate yaw and origin."
 
 
 def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:

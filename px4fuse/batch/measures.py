@@ -75,7 +75,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
 def _matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield matching paths, such as ``axes.north.rejected_fraction`` with the names ("north",)."""
+    """Yield the paths that match a pattern, each with the names that replace ``*``."""
     parent, has_wildcard, rest = pattern.partition(".*")
     if not has_wildcard:
         yield pattern, ()

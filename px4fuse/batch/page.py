@@ -241,7 +241,7 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
 
 
 def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
-    """Combine the non-empty columns of a log; those of the main axes replace those of others."""
+    """Combine the rows of a log, one per axis; values of the main axes replace those of others."""
     axes = [row for row in rows if "axis" in row]
     main_rows = next(
         (m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows

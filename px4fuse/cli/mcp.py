@@ -100,7 +100,7 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    if out and sender:  # the server itself writes nothing
+    if out and sender:  # a worker process: commands in the server process write no files
         os.chdir(out)
     text, results = io.StringIO(), list[str]()
     try:
@@ -160,7 +160,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
-    """Return the parameters of a command that its tool has, by the name of the argument."""
+    """Return the parameters of a command that are arguments of its tool, by argument name."""
     command = cli.get_command(click.Context(cli), command_name)
     assert command is not None
     names = {str(one.name): one for one in command.params if one.expose_value}

@@ -240,11 +240,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         else slice(None)
     )
 
-    def stacked(name: str, rows: slice = slice(None)) -> Any:
+    def stack_configurations(name: str, rows: slice = slice(None)) -> Any:
         arrays = [getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals]
         return np.stack(arrays, axis=1)[:, configuration_intervals]
 
-    event_table = stacked("events")
+    event_table = stack_configurations("events")
     action = np.where(has_gate, event_table["action"], np.where(event_table["usable"], FUSE, IDLE))
     event_steps = event_table["end_step"]
     is_active = action > IDLE
@@ -392,12 +392,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
-            transition = stacked("transition", event_batch)
-            state_input = stacked("acceleration_input", event_batch) + has_attitude[
+            transition = stack_configurations("transition", event_batch)
+            state_input = stack_configurations("acceleration_input", event_batch) + has_attitude[
                 :, None
-            ] * stacked("correction_input", event_batch)
-            added_noise = gyro_variance * stacked("gyro_noise", event_batch)
-            accelerometer_noise = stacked("accelerometer_noise", event_batch)
+            ] * stack_configurations("correction_input", event_batch)
+            added_noise = gyro_variance * stack_configurations("gyro_noise", event_batch)
+            accelerometer_noise = stack_configurations("accelerometer_noise", event_batch)
             added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
             variance_growth = variance_increment * steps[event_batch]
         phi = transition[batch_index]

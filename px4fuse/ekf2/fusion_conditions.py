@@ -70,7 +70,7 @@ GNSS_CHECKS = (
 )
 
 
-class Unmet(NamedTuple):
+class UnmetCondition(NamedTuple):
     """Condition of EKF2 that is not met: its name, a title, an explanation and the action."""
 
     condition: str
@@ -79,7 +79,7 @@ class Unmet(NamedTuple):
     action: str
 
 
-UNKNOWN = Unmet(
+UNKNOWN = UnmetCondition(
     "",
     "",
     "The log does not contain the reason: the logged conditions of EKF2 are met.",
@@ -117,7 +117,7 @@ class Attempt:
     def interval_s(self) -> float:
         return 1.0 / self.source.rate_hz
 
-    def within(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
+    def samples_in_span(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
         """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
@@ -130,13 +130,13 @@ class Attempt:
         return float(np.mean(values.astype(np.int64) >> bit & 1))
 
 
-def find_unmet(attempt: Attempt) -> Unmet:
+def find_unmet(attempt: Attempt) -> UnmetCondition:
     """Return the first condition that is not met, in EKF2's order; UNKNOWN if all are met."""
     conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
     return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN)
 
 
-def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
+def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
     name, bit = attempt.aid.switch, 0
     if not attempt.has_switch:
         name, bit = AID_MASK, 3 if attempt.is_vision else 0
@@ -151,7 +151,7 @@ def _check_switch(attempt: Attempt) -> Iterator[Unmet]:
     if is_height_only(attempt.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {name} unset."
-    yield Unmet("switch", f"{name} is {value}", reason, action)
+    yield UnmetCondition("switch", f"{name} is {value}", reason, action)
 
 
 def is_height_only(source: PositionTrack) -> bool:
@@ -159,10 +159,10 @@ def is_height_only(source: PositionTrack) -> bool:
     return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
 
 
-def _check_frame(attempt: Attempt) -> Iterator[Unmet]:
+def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
     source = attempt.source
     if attempt.has_switch and (source.frame, source.name) == ("unknown", "vehicle_visual_odometry"):
-        yield Unmet(
+        yield UnmetCondition(
             "frame",
             "the pose_frame is unknown",
             "EKF2 (v1.14 and later) reads positions only in the frames NED (1) and FRD (2).",
@@ -171,7 +171,7 @@ def _check_frame(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
+def _check_gap(attempt: Attempt) -> Iterator[UnmetCondition]:
     is_short = attempt.is_vision and attempt.has_switch
     limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
     times_s = attempt.source.samples.index.to_numpy()
@@ -180,7 +180,7 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
     last_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_s
     if duration_s > limit_s + attempt.interval_s:
-        yield Unmet(
+        yield UnmetCondition(
             "gap",
             f"no position for {duration_s:.1f} s from {last_s:.1f} s on",
             f"EKF2 stops fusion {limit_s:g} s after the last position.",
@@ -188,10 +188,10 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
+def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
     clock_map, status = attempt.source.clock_map, attempt.source.status
     if clock_map and (clock := clock_map.clock) in STAMP_FAULTS:
-        yield Unmet(
+        yield UnmetCondition(
             "clock",
             f"the timestamps are {clock if clock == '0' else f'in {clock}'}",
             "EKF2 reads timestamp_sample in microseconds since the autopilot's boot. For EKF2 the "
@@ -201,9 +201,9 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
     if "age_s" not in status:
         return
     delay_s = attempt.parameters.get(attempt.aid.delay, 0.0) * 1e-3
-    age_s = float(attempt.within(status)["age_s"].median()) + delay_s
+    age_s = float(attempt.samples_in_span(status)["age_s"].median()) + delay_s
     if -age_s > BUFFER_COUNT * attempt.interval_s:
-        yield Unmet(
+        yield UnmetCondition(
             "age",
             f"the timestamps are {-age_s:.2f} s in the future",
             f"EKF2 waits until this time, but buffers only {BUFFER_COUNT} positions.",
@@ -216,7 +216,7 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
                 "Check the clock of the positioning system. Then set EKF2_DELAY_MAX to "
                 f"{50.0 * np.ceil(20.0 * age_s):.0f} ms (v1.15 and later)."
             )
-        yield Unmet(
+        yield UnmetCondition(
             "age",
             f"the positions are {age_s:.2f} s old at arrival",
             f"EKF2 buffers only {attempt.horizon_s:.2f} s. Timestamps that are too early have the "
@@ -225,11 +225,11 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-def _check_quality(attempt: Attempt) -> Iterator[Unmet]:
+def _check_quality(attempt: Attempt) -> Iterator[UnmetCondition]:
     minimum, status = attempt.parameters.get("EKF2_EV_QMIN", 0.0), attempt.source.status
     if minimum <= 0.0 or "quality" not in status:
         return
-    quality = attempt.within(status)["quality"]
+    quality = attempt.samples_in_span(status)["quality"]
     # EKF2 needs a good quality of the sample, of the sample before, and of the newest sample in the
     # buffer
     count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
@@ -248,16 +248,16 @@ def _check_quality(attempt: Attempt) -> Iterator[Unmet]:
         reason += " The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
         action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median:.0f}, below EKF2_EV_QMIN {minimum:.0f}"
-    yield Unmet("quality", fault, reason, action)
+    yield UnmetCondition("quality", fault, reason, action)
 
 
-def _check_interval(attempt: Attempt) -> Iterator[Unmet]:
-    intervals_s = np.diff(attempt.within(attempt.source.samples).index)
+def _check_interval(attempt: Attempt) -> Iterator[UnmetCondition]:
+    intervals_s = np.diff(attempt.samples_in_span(attempt.source.samples).index)
     # a source that is reconstructed from EKF2 topics has the rate of the logger, not of the
     # positioning system
     is_known = attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
     if is_known and intervals_s.min() >= EV_START_INTERVAL_S - TIME_STEP_S:
-        yield Unmet(
+        yield UnmetCondition(
             "interval",
             f"the positions come at {attempt.source.rate_hz:.2g} Hz",
             f"The interval between positions is {attempt.interval_s:.2f} s. EKF2 (v1.14 and later) "
@@ -267,9 +267,9 @@ def _check_interval(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-def _check_alignment(attempt: Attempt) -> Iterator[Unmet]:
+def _check_alignment(attempt: Attempt) -> Iterator[UnmetCondition]:
     if attempt.fraction("tilt_align") < 0.5:
-        yield Unmet(
+        yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its tilt",
             "The flag cs_tilt_align is 0. EKF2 fuses no position before the tilt is aligned.",
@@ -280,7 +280,7 @@ def _check_alignment(attempt: Attempt) -> Iterator[Unmet]:
         action = "Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"
         if attempt.is_vision:
             action += ", or send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL"
-        yield Unmet(
+        yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its heading",
             "The flag cs_yaw_align is 0. EKF2 needs a heading to fuse positions relative to north.",
@@ -288,9 +288,9 @@ def _check_alignment(attempt: Attempt) -> Iterator[Unmet]:
         )
 
 
-def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
+def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
     if attempt.fraction("gnss_fault") > MIN_FAILED_FRACTION:
-        yield Unmet(
+        yield UnmetCondition(
             "fault",
             "EKF2 declared GNSS faulty",
             "The flag cs_gnss_fault is set: GNSS and another position source contradicted each "
@@ -305,10 +305,10 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
     if not failed:
         return
     failed.sort(key=lambda bit: -fractions[bit])
-    samples = attempt.within(source.samples)
+    samples = attempt.samples_in_span(source.samples)
     squares = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
-        squares[5] = attempt.within(source.velocity)["north_m2_s2"]
+        squares[5] = attempt.samples_in_span(source.velocity)["north_m2_s2"]
     texts = []
     for bit in failed[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
@@ -319,7 +319,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
             text += f", median {value:.2f}{unit}" if value > limit else ""
             text += f", limit {parameter} {limit:g}{unit}"
         texts.append(f"{text})")
-    yield Unmet(
+    yield UnmetCondition(
         "checks",
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0]][0]}",
         f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
@@ -328,14 +328,14 @@ def _check_gnss(attempt: Attempt) -> Iterator[Unmet]:
     )
 
 
-def _check_gate(attempt: Attempt) -> Iterator[Unmet]:
+def _check_gate(attempt: Attempt) -> Iterator[UnmetCondition]:
     aid = attempt.aid
     log = attempt.ekf2.aids.get(aid.name)
     if log is None or "rejected" not in log.samples:
         return
-    fraction = attempt.within(log.samples, GATE_TIME_S)["rejected"].mean()
+    fraction = attempt.samples_in_span(log.samples, GATE_TIME_S)["rejected"].mean()
     if fraction > 0.5:
-        yield Unmet(
+        yield UnmetCondition(
             "gate",
             f"EKF2 rejects {100.0 * fraction:.0f} % of the positions",
             "The innovations are beyond EKF2's gate of "

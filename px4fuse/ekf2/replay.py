@@ -335,8 +335,8 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if not len(times):
         return None
     north, east = (
-        along(replay.published, Columns.POSITION, direction, times)
-        - along(ekf2.state, Columns.POSITION, direction, times)
+        component_along(replay.published, Columns.POSITION, direction, times)
+        - component_along(ekf2.state, Columns.POSITION, direction, times)
         for direction in np.eye(3)[:2]
     )
     return float(np.hypot(north, east).max())
@@ -470,8 +470,8 @@ def _axis_agreement(
     times = ekf2.state.index[inside_spans(ekf2.state.index, replay.evaluated_s)].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
     position, velocity = (
-        along(replay.published, columns, direction, times)
-        - along(ekf2.state, columns, direction, times)
+        component_along(replay.published, columns, direction, times)
+        - component_along(ekf2.state, columns, direction, times)
         for columns in (Columns.POSITION, Columns.VELOCITY)
     )
     return AxisAgreement(
@@ -487,7 +487,9 @@ def _axis_agreement(
     )
 
 
-def along(vectors: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
+def component_along(
+    vectors: pd.DataFrame, columns: list[str], direction: Array, times: Array
+) -> Array:
     """Interpolate the component of a vector (NED columns) along a direction."""
     component = signals.weighted_sum(vectors, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, vectors.index, component))

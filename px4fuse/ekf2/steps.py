@@ -21,7 +21,7 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans, rms_to_truth
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -183,24 +183,17 @@ def explain_by_steps(
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    without_gate = flown_replay.delayed
     stages = []
     # tracks are computed one at a time, to limit memory
     tracks = chain(delayed, (flown_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
-                [along(track, columns, direction, times) for columns in TRACK_COLUMNS]
+                [component_along(track, columns, direction, times) for columns in TRACK_COLUMNS]
                 for direction in directions.values()
             ]
         )
-        if stage in (
-            ATTITUDE,
-            FIELD_STEP,
-            VELOCITY_STEP,
-            FLOW_STEP,
-            VISION_STEP,
-        ):  # the replay before GATE has all EKF2 properties except gate and output predictor
+        if stage == [*configurations][-2]:  # all EKF2 properties but gate and output predictor
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(flown_replay, without_gate, span, evaluated_spans)
@@ -215,27 +208,36 @@ def explain_by_steps(
         errors = [
             rms_to_truth(model.flight, track, direction, times) for track in positions_by_step[:, 0]
         ]
-        position, velocity = np.mean(difference[:-1] ** 2, axis=2).T.tolist()
+        mean_squares = np.mean(difference[:-1] ** 2, axis=2)
         position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
         steps = tuple(
             Step(
                 name=name,
-                position_mean_square_m2=position[step_index - 1] - position[step_index],
-                velocity_mean_square_m2_s2=velocity[step_index - 1] - velocity[step_index],
-                position_moved_m=float(position_change[step_index - 1].max()),
-                moved_at_s=float(times[position_change[step_index - 1].argmax()]),
-                position_rmse_to_truth_m=errors[step_index],
+                position_mean_square_m2=position_reduction,
+                velocity_mean_square_m2_s2=velocity_reduction,
+                position_moved_m=float(change.max()),
+                moved_at_s=float(times[change.argmax()]),
+                position_rmse_to_truth_m=error,
             )
-            for step_index, name in enumerate((*configurations, OUTPUT), start=1)
+            for name, (position_reduction, velocity_reduction), change, error in zip(
+                (*configurations, OUTPUT),
+                (mean_squares[:-1] - mean_squares[1:]).tolist(),
+                position_change,
+                errors[1:-1],
+                strict=True,
+            )
+        )
+        (position, velocity), *_, (unexplained_position, unexplained_velocity) = (
+            mean_squares.tolist()
         )
         filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
         steps_by_axis[axis] = DifferenceExplanation(
             count=len(times),
-            position_mean_square_m2=position[0],
-            velocity_mean_square_m2_s2=velocity[0],
+            position_mean_square_m2=position,
+            velocity_mean_square_m2_s2=velocity,
             steps=steps,
-            unexplained_mean_square_m2=position[-1],
-            unexplained_velocity_mean_square_m2_s2=velocity[-1],
+            unexplained_mean_square_m2=unexplained_position,
+            unexplained_velocity_mean_square_m2_s2=unexplained_velocity,
             position_rmse_to_truth_m={
                 name: no_truth if error is None else error for name, error in filter_errors.items()
             },

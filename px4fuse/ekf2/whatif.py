@@ -21,8 +21,8 @@ from px4fuse.ekf2.replay import (
     Agreement,
     Ekf2Replay,
     Spans,
-    along,
     axes_of,
+    component_along,
     inside_spans,
     logged_aid_innovations,
     logged_innovations,
@@ -466,7 +466,7 @@ def _make_summary(
     times = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
-        position = along(published_track, Columns.POSITION, direction, times)
+        position = component_along(published_track, Columns.POSITION, direction, times)
         error = rms_to_truth(flight, position, direction, times)
         return NO_TRUTH if error is None else error
 

@@ -46,7 +46,7 @@ SCENARIO_VALUES: dict[str, Any] = {
 }
 # Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
-# Finding of the analysis that contains the time span of each injected fault
+# Id of the finding whose time span is the time span of the injected fault
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",

@@ -49,7 +49,7 @@ UNUSABLE = (
 ANNOUNCED = "reset_at_s"
 WITHOUT = "source_without_position"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
-# Causes that explain other findings only if they are no notes
+# Causes that explain other findings only as warnings or errors
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
 # Effects whose action corrects their cause, too, so that either action is enough
 ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)

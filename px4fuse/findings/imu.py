@@ -92,7 +92,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # the fitted positions show no horizontal bias
+        # the fit shows no horizontal bias, so only the vertical bias is reported
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )

@@ -78,7 +78,7 @@ SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
 
 
 def source_words(source: PositionTrack) -> SourceWords:
-    """Return the words of findings about a position source, which fit its kind of sensor."""
+    """Return the parts of messages and actions for the kind of sensor of a position source."""
     return SOURCE_WORDS[source.origin.kind]
 
 

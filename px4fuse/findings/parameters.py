@@ -69,7 +69,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _differ(before: float, after: float) -> bool:
-    """Return True if the ratio of two known values is at least MIN_EFFECT, or its inverse."""
+    """Return True if both values are known and differ by more than the factor MIN_EFFECT."""
     return before > 0.0 and after > 0.0 and abs(math.log(after / before)) > math.log(MIN_EFFECT)
 
 

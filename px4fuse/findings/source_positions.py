@@ -49,6 +49,8 @@ NOISE_RANGE_FACTOR = 1.25 * 3.29
 MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum gain of the log likelihood by a low pass over time-correlated noise without lag
 MIN_LAG_NATS = 1.0
+# Maximum ratio of the lag of a low pass to the latest end of the time offset's 95 % interval
+MAX_LAG_RATIO = 4.0
 # Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
 # Minimum lag (s) by a low pass, for severity error: a position error of 10 cm at 1 m/s
@@ -63,11 +65,11 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of one of many jumps without a change of reset_counter
 MIN_SMALL_JUMP_M = 0.1
-# Minimum size of such a jump in medians of the differences of successive steps
+# Minimum ratio of a jump without a change of reset_counter to the median change between steps
 MIN_STEP_RATIO = 8.0
-# Number of differences for the median
+# Number of step differences in the running median
 NOISE_SAMPLES = 61
-# Minimum number of steps between positions to find jumps
+# Minimum number of positions for the detection of jumps
 MIN_JUMP_ROWS = 100
 # Minimum time (s) and minimum number of positions for which a jump lasts: outliers are shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
@@ -136,8 +138,9 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     clock, correlation = analysis.clock, analysis.time_correlated_noise
-    # with fast samples the correlation determines the lag badly, the time offset shows it directly
-    if isinstance(clock, ClockOffset) and low_pass.lag_s > -clock.interval_s[0] >= MIN_LAG_S:
+    # at a high rate the correlation gives an inaccurate lag; the time offset contains the lag
+    limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # a low pass delays positions: correlated errors without a lag have another cause
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
@@ -229,7 +232,7 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
 
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
-    """Detect a source that jumps again and again: it corrects its drift, or measures two points."""
+    """Detect a source that jumps repeatedly: it corrects drift, or alternates between points."""
     ekf2 = analysis.flight.ekf2
     jumps, is_announced = _find_jumps(analysis)
     if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:

@@ -21,8 +21,13 @@ MIN_LATENCY_S = 0.02
 MIN_LATENCY_ERROR_S = 0.10
 # Minimum number of positions before, and after, the time at which TIMESYNC converged
 MIN_SAMPLES = 10
-# Minimum fraction of arrival times before, and of measurement times after, that time
+# Minimum fraction of timestamps that are arrival times before TIMESYNC converged, and measurement
+# times after it
 MIN_CONSISTENT_FRACTION = 0.95
+# Minimum mean number of positions in a burst
+MIN_BURST = 2.5
+# Maximum ratio of the interval within bursts to the pause between them
+MAX_BURST_RATIO = 0.1
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -48,10 +53,22 @@ def detect(analysis: Analysis) -> Findings:
         yield warning(
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            f"arrival times as times of measurement. {kf_times}",
+            f"arrival times as times of measurement. {kf_times}{_describe_bursts(analysis)}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
+
+
+def _describe_bursts(analysis: Analysis) -> str:
+    """Return a sentence on positions that arrive in bursts; empty if they arrive one by one."""
+    intervals_s = np.diff(analysis.source.samples.index.to_numpy())
+    is_pause = intervals_s > intervals_s.mean()
+    if not is_pause.any() or (count := 1.0 / float(is_pause.mean())) < MIN_BURST:
+        return ""
+    pause_s = float(np.median(intervals_s[is_pause]))
+    if np.median(intervals_s[~is_pause]) > MAX_BURST_RATIO * pause_s:
+        return ""
+    return f" The positions arrive in bursts of {count:.0f}, every {pause_s:.2g} s."
 
 
 def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:

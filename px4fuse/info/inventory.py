@@ -263,7 +263,7 @@ def _source(
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
-    """Measure gaps of more than 0.1 s (IMU, as in KF) or 1 s, and of five median intervals."""
+    """Measure intervals longer than 0.1 s (IMU) or 1 s, and than five median intervals."""
     intervals = np.diff(samples.index.to_numpy())
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))

@@ -56,7 +56,7 @@ class Server(MCPServer[Any]):
     Parameters
     ----------
     tools : list of (Tool, Parse)
-        Tools; one without output schema is no analysis, and runs in this process.
+        Tools; a tool without output schema runs in this process, because it is not an analysis.
     run : callable
         Function at the top level of a module, because worker processes call it: runs a command
         line, and sends its activities to a connection.

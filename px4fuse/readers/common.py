@@ -17,7 +17,7 @@ MAX_IMU_VALUE = 1e4
 MIN_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a position from the median position to reject it as not measured
 MIN_FAR_M = 1e4
-# Minimum distance of such a position in median distances
+# Minimum ratio of this distance to the median distance of all positions
 MIN_FAR_RATIO = 100.0
 # Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
 # sources that send each position several times repeat it for a shorter time

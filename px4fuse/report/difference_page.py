@@ -63,13 +63,13 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanations of KF - EKF2 along the aisle, else along all axes."""
+    """Return the explanations of the difference KF - EKF2 along the aisle, else along all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the explanation of KF - EKF2, or the reason why it is missing."""
+    """Write the explanation of the difference KF - EKF2, or the reason why it is missing."""
     if isinstance(explanation, Unavailable):
         page.write_labelled(
             "KF-EKF2", f"The difference KF - EKF2 is not explained: {explanation.reason}."

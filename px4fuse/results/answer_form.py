@@ -99,7 +99,7 @@ PREDICTIONS_HEAD = """
 
 
 class Prediction(Record, frozen=True):
-    """Question which of five ranges contains a number of the flight, simulated with one change.
+    """Number of the flight simulated with one change: the student chooses one of five ranges.
 
     ``quantity`` names the number and the change, ``limits`` are the four limits between the ranges.
     """

@@ -348,13 +348,13 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
     components: dict[str, Any] = {}
 
     def describe(kind: Any) -> dict[str, Any]:
-        if kind is msgspec.UnsetType:  # a field that is not written
+        if kind is msgspec.UnsetType:  # an unset field is not written
             return {"not": {}}
         kinds.update(dict.fromkeys(kind.union_members))
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
     count = 0
-    # repeated until describe finds no new types inside of RecordOrUnavailable types
+    # repeated until describe adds no type from inside another type
     while count < len(kinds):
         count = len(kinds)
         schemas, components = msgspec.json.schema_components(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_with_logged_rejections
-from px4fuse.ekf2.replay import agreement_with_log, along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import agreement_with_log, component_along, inside_spans, rms_to_truth
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -90,7 +90,9 @@ def flown_errors_m(before: FlownFlight, after: FlownFlight, found: WhatIf) -> tu
     spans = [(begin + shift_s, end + shift_s) for begin, end in found.evaluated_s]
     times = ekf2.state.index[inside_spans(ekf2.state.index, tuple(spans))].to_numpy()
     north, east, down = (
-        rms_to_truth(after.flight, along(ekf2.state, Columns.POSITION, axis, times), axis, times)
+        rms_to_truth(
+            after.flight, component_along(ekf2.state, Columns.POSITION, axis, times), axis, times
+        )
         for axis in np.eye(3)
     )
     assert north is not None

@@ -223,7 +223,7 @@ def _make_attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """Make the row of the class table that has this report as the only report of the student."""
+    """Make a row of the class table as if this report were the only one of the student."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
     due_time = course.due

@@ -112,7 +112,7 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
     """Count the equal numbers of two answer forms, without numbers of one digit.
 
-    SAME_NUMBER_TOLERANCE is not used for the values of corrections and lists, which must be equal.
+    Values of corrections and lists must be exactly equal, others within SAME_NUMBER_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1
