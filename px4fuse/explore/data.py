@@ -29,7 +29,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
-from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
+from px4fuse.request import ComparisonRequest, command_line
 
 # Data of the page, which become JSON
 Data = dict[str, Any]
@@ -61,7 +61,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
         },
         "command": _command_data(request, analysis),
         "offset": _offset_data(request, analysis),
-        "ekf2": _ekf2_settings(request, analysis),
+        "flown": _ekf2_settings(analysis),
     }
 
 
@@ -273,22 +273,14 @@ def _likely_noises(analysis: Analysis) -> Data:
     }
 
 
-def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
-    """Return EKF2's parameters of the source, and a command that replays EKF2."""
+def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
+    """Return EKF2's parameters of the source with their units."""
     aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
-    flown_settings = {
+    return {
         name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
         for name in (aid.noise, aid.delay, aid.gate)
         if name in logged_parameters and name in PARAMETERS
     }
-    if isinstance(analysis.ekf2_model, Unavailable):
-        return {"flown": flown_settings, "why": analysis.ekf2_model.reason}
-    # half of the logged noise: an example whose effect on S and on the error is visible
-    parameter = PARAMETERS[aid.noise]
-    flown_m = logged_parameters.get(aid.noise, parameter.default)
-    changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
-    replay_request = WhatIfRequest(log=request.log, system=request.system, changes=changes)
-    return {"flown": flown_settings, "command": command_line(replay_request, for_shell=True)}
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> Data:

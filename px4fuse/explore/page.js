@@ -452,11 +452,8 @@ const Explore = (async () => {
     moved: (time) => { times.showTime(time); toAddress(); } });
   const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); } };
   const times = Times.start({ flight, model, setSource, timeRange, figures, redraw, keys });
-  const { flown, command: example, why: noReplay } = flight.ekf2;
-  for (const [name, value] of Object.entries(flown)) $("flown").append(make("dt", name), make("dd", value));
-  if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));
-  $("whatif-command").textContent = example ?? "";
-  if (noReplay) $("whatif").replaceChildren(make("p", `EKF2 cannot be replayed: ${noReplay}.`, "note"));
+  for (const [name, value] of Object.entries(flight.flown)) $("flown").append(make("dt", name), make("dd", value));
+  if (!Object.keys(flight.flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();

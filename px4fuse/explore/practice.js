@@ -25,7 +25,7 @@ const Practice = (() => {
   async function start(page) {
     $("quiz-title").textContent = `Flight ${current + 1} of ${count}: find the fault`;
     // commands need a log file, which a simulated flight does not have
-    for (const id of ["as-report", "whatif", "task"]) $(id).hidden = true;
+    for (const id of ["as-report", "task"]) $(id).hidden = true;
     const boxes = queryAll("[name=choice]"), chosen = answers[current].split(" ");
     for (const box of boxes) {
       box.disabled = !isOpen;
