@@ -20,10 +20,10 @@ MAX_LATITUDE_DISTANCE_DEG = 1.0
 FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 # Maximum deviation (s) of a logged interval from a multiple of the receiver's interval: half of an
 # EKF2 prediction interval, plus clock jitter
-MAX_GRID_ERROR_S = 0.006
+MAX_MULTIPLE_ERROR_S = 0.006
 # Minimum number of logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals with n, and with n + 1, receiver intervals, to estimate the
+# Minimum number of logged intervals of n, and of n + 1, receiver intervals for an estimate of the
 # receiver interval
 MIN_REPEATED_INTERVALS = 3
 # Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
@@ -69,28 +69,17 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Reconstruct unlogged fixes between logged fixes as EKF2 position plus innovation.
+    """Reconstruct unlogged fixes as EKF2 position plus innovation (PX4 up to v1.15).
 
-    1. Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
-       log time. That fix is a whole number n of receiver intervals after a logged fix.
-    2. For n = 0 the fix itself is logged, which gives the reconstruction error. If the error
-       exceeds MAX_RECONSTRUCTION_ERROR_M, no fixes are returned.
+    Return the fixes, with interpolated heights, and a note; both are empty if the error at logged
+    fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
     fixes : DataFrame
-        Logged fixes: positions (m, NED) and variances, indexed by the measurement time that EKF2
-        assumes.
-    ekf2 : Ekf2 or Unavailable
+        Logged fixes (m, NED) and variances, indexed by the measurement time that EKF2 assumes.
     delay_s : float
-        Delay between measurement and timestamp that EKF2 assumes. A fix older than the fusion
-        horizon is fused at the horizon (``RingBuffer.h``).
-
-    Returns
-    -------
-    (DataFrame, str)
-        Fixes that are not in ``fixes``, with interpolated heights, and a note; empty if no fix can
-        be reconstructed.
+        Delay from measurement to timestamp that EKF2 assumes.
     """
     no_fixes = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
@@ -101,8 +90,11 @@ def reconstruct_fixes(
     interval_s = _interval_s(fix_s)
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes
+    # EKF2 fuses a fix older than the fusion horizon at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
+    # An innovation, logged at 2 Hz, belongs to the last fix before it, which is a whole number of
+    # receiver intervals after a logged fix. If the number is 0, the fix itself is logged
     previous_fix = np.searchsorted(fix_s, fused_s) - 1
     intervals_passed = (fused_s - fix_s[previous_fix]) / interval_s
     is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
@@ -140,26 +132,23 @@ def reconstruct_fixes(
 
 
 def _interval_s(times: Array) -> float | None:
-    """Estimate the receiver's interval (s), of which all logged intervals are multiples.
+    """Return the longest interval (s) of which all logged intervals are multiples.
 
-    The longest possible interval is returned. None if all logged intervals are equal, because the
-    multiple is then unknown.
+    Return None if all logged intervals are equal, because the multiple is then unknown.
     """
-    gaps = np.diff(times)[:, None]
-    multiples = gaps / FIX_INTERVALS_S
-    grid_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
-    worst_error_s = np.percentile(grid_error_s, 98, axis=0)
-    fitting_periods = np.flatnonzero(worst_error_s <= MAX_GRID_ERROR_S)
-    if not len(fitting_periods):
+    logged_s = np.diff(times)[:, None]
+    multiples = logged_s / FIX_INTERVALS_S
+    multiple_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
+    worst_error_s = np.percentile(multiple_error_s, 98, axis=0)
+    possible_intervals = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
+    if not len(possible_intervals):
         return None
-    longest_period_s = FIX_INTERVALS_S[fitting_periods[-1]]
+    longest_s = FIX_INTERVALS_S[possible_intervals[-1]]
     # Use the interval with the smallest error within 10 % of the longest possible interval
-    near_periods = np.flatnonzero(
-        np.abs(FIX_INTERVALS_S - longest_period_s) < 0.1 * longest_period_s
-    )
-    best_period_s = FIX_INTERVALS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
-    interval_multiples = np.round(gaps[:, 0] / best_period_s)
+    near_intervals = np.flatnonzero(np.abs(FIX_INTERVALS_S - longest_s) < 0.1 * longest_s)
+    best_s = FIX_INTERVALS_S[near_intervals[np.argmin(worst_error_s[near_intervals])]]
+    interval_multiples = np.round(logged_s[:, 0] / best_s)
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
-    return float(np.median(gaps[:, 0] / interval_multiples))
+    return float(np.median(logged_s[:, 0] / interval_multiples))
