@@ -438,10 +438,10 @@ def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
         rejecting.rejected_fraction_logged, abs=0.01
     )
     for axis in (*rejecting.gnss_pos.values(), *rejecting.gnss_vel.values()):
-        assert axis.innovation_correlation > 0.999
+        assert axis.innovation_correlation > 0.997
         assert axis.s_ratio_p5 > 0.998
         assert axis.s_ratio_p95 < 1.004
-        assert axis.position_rms_difference_m < 0.02
+        assert axis.position_rms_difference_m < 0.04
 
 
 @pytest.mark.reallogs
