@@ -55,8 +55,6 @@ MIN_OFFSET_SIGMAS = 3.0
 MIN_OFFSET_S = 0.03
 # Number of simulations of the IMU noise for the variance of the time offset
 SIMULATION_COUNT = 96
-# Step of ln σ for numerical derivatives of the likelihood with respect to the noises
-LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
