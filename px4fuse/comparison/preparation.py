@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct_convention, find_faults
+from px4fuse.convention.correction import convention_faults, correct_convention
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import CLOCK_OFFSET_RANGE_S, SIGMA_Z_RANGE_M, Settings
@@ -85,7 +85,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     convention = None if is_withheld else check_convention(flight, track)
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
-    late_s = find_faults(convention, flight, track.frame).late_s
+    late_s = convention_faults(convention, flight, track.frame).late_s
     # a time offset beyond the range of the settings is found at the edge of the searched range
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *CLOCK_OFFSET_RANGE_S))
     settings = replace(settings, clock_offset_s=clock_offset_s)

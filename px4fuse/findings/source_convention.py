@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import UNITS
-from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
+from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, convention_faults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
@@ -112,7 +112,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
 
 
 def _faults(analysis: Comparison) -> Faults:
-    return find_faults(analysis.convention, analysis.flight, analysis.source.frame)
+    return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
 def _position_faults(
