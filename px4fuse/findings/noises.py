@@ -25,7 +25,7 @@ from px4fuse.comparison.trials import (
     find_trials,
 )
 from px4fuse.core.text import format_factor, format_number, format_ratio
-from px4fuse.filter.settings import SETTING_UNITS, Settings
+from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.finding import SEVERITIES, Finding, Severity
@@ -176,7 +176,7 @@ def _setting_finding(
 
 
 def format_estimate(name: str, setting: float, noise: Noise) -> str:
-    label, unit = name[:7].upper(), SETTING_UNITS[name]
+    label, unit = name[:7].upper(), SETTING_RANGES[name].unit
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
     if noise.value is not None and noise.high:
