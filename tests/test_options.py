@@ -86,5 +86,5 @@ def test_files_to_change_for_a_new_option_are_documented() -> None:
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
-    with pytest.raises(KeyError, match="'lidar', 'as received'"):
+    with pytest.raises(ValueError, match="ORIGINS has no kind and path"):
         find_origin("lidar", "as received")
