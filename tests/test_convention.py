@@ -343,7 +343,7 @@ def test_ambiguous_source_axes_finding_lists_possible_axes():
 
 
 @pytest.mark.parametrize(("axes", "message", "remedy"), [
-    (("north", "east", "up"), "X and y are exchanged: x is east, y north, z down", "(y, x, z)"),
+    (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
     (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
 ])  # fmt: skip
 def test_position_file_in_wrong_frame_finding_names_the_frame(axes, message, remedy):

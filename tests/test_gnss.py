@@ -30,7 +30,8 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
 from px4fuse.flight.model import Columns, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.flight.position_source import GNSS
-from px4fuse.readers import read_log
+from px4fuse.readers import px4_fixes, read_log
+from px4fuse.readers.px4_fixes import reconstruct_fixes
 from px4fuse.report.clock import clock_advice
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate_flight
@@ -646,3 +647,60 @@ def test_read_gnss_drops_damaged_fix_and_its_velocity(tmp_path):
     fixes["altitude_msl_m"][20] = 1e30
     track = track_of(flight_of(log, tmp_path))
     assert track.velocity.index.equals(track.samples.index)
+
+
+@pytest.mark.parametrize(
+    "recorded", [False, pytest.param(True, marks=pytest.mark.reallogs)], ids=["model", "real EKF2"]
+)
+def test_gnss_fix_reconstruction_recovers_missing_fixes(recorded, request):
+    """Keep every fourth to sixth fix of a complete flight, and two innovations per second."""
+    if recorded:
+        folder = request.getfixturevalue("shared_logs")
+        flight = read_log(folder / "gps" / "v1.16.1_gps_fullrate.ulg")
+    else:
+        flight = simulate_flight(make_scenario("outdoor", seed=2, gnss_rate_hz=10.0))
+    track = track_of(flight)
+    every = track.samples[track.samples.index > 5.0]
+    log = flight.ekf2.aids["gnss_pos"]
+    taken = every.index.to_numpy()
+    shown = log.samples.set_axis(log.samples.index + 0.5 * flight.ekf2.step_s)
+    at = np.searchsorted(shown.index, taken[2::7])
+    at = at[np.abs(shown.index.to_numpy()[at] - taken[2::7]) < 0.002]
+    # rows show the last fix before them
+    rows = shown.iloc[at].set_axis(shown.index[at] + 0.03)
+    ekf2 = replace(
+        flight.ekf2, aids=dict(flight.ekf2.aids) | {"gnss_pos": replace(log, samples=rows)}
+    )
+    remaining = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
+    made, note = reconstruct_fixes(remaining, ekf2, 0.11)
+
+    def note_of(samples: pd.DataFrame) -> str:
+        aids = dict(ekf2.aids) | {"gnss_pos": replace(log, samples=samples)}
+        return reconstruct_fixes(remaining, replace(ekf2, aids=aids), 0.11)[1]
+
+    assert len(made) > 60
+    assert "0.0" in note
+    true = every.iloc[np.abs(taken[:, None] - made.index.to_numpy()).argmin(axis=0)]
+    assert np.abs(true.index - made.index).max() < 0.01
+    error = (made[Columns.POSITION[:2]] - true[Columns.POSITION[:2]].to_numpy()).to_numpy()
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.isfinite(made[Columns.POSITION]).all(axis=None)
+    # no reconstruction from wrong innovations
+    assert note_of(rows.assign(innovation_north=rows["innovation_north"] + 0.5)) == ""
+    # nor from a row in the fusion step, whose fix is ambiguous
+    assert note_of(rows.set_axis(rows.index - 0.03)) == ""
+    unknown = Unavailable("horizon", "not logged", "Log it.")
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=unknown), 0.11)[1] == ""
+    # a fix older than the horizon is fused at the horizon
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=0.05), 0.11)[1] != note
+
+
+def test_gnss_receiver_interval_is_found_from_logged_fixes():
+    rng = np.random.default_rng(3)
+    for interval_s in (0.1, 0.096, 0.2, 0.125):
+        remaining = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s
+        found = px4_fixes._interval_s(remaining + rng.normal(0.0, 0.0005, 100))
+        assert found == pytest.approx(interval_s, rel=0.01)
+    assert px4_fixes._interval_s(np.cumsum(rng.uniform(0.3, 0.9, 100))) is None
+    # ambiguous: every fifth of 0.1 s, or every fourth of 0.125 s
+    assert px4_fixes._interval_s(np.arange(100) * 0.5) is None

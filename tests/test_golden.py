@@ -171,8 +171,11 @@ def test_command_output_matches_reference_file(
 
 
 @pytest.mark.usefixtures("cached_analyses")
-def test_session_in_page_on_assistants_has_current_answers() -> None:
+def test_session_in_page_on_assistants_has_current_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The page contains calls of the tools of `px4fuse mcp`, each followed by its answer."""
+    monkeypatch.delenv("COLUMNS", raising=False)  # set by pytest-xdist
     page = REPOSITORY / "docs" / "assistants.md"
     parsers = {tool.name: parse for tool, parse in make_tools((SAMPLES,))}
 

@@ -49,7 +49,8 @@ NOISE_RANGE_FACTOR = 1.25 * 3.29
 MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum gain of the log likelihood by a low pass over time-correlated noise without lag
 MIN_LAG_NATS = 1.0
-# Maximum ratio of the lag of a low pass to the latest end of the time offset's 95 % interval
+# A fitted lag above this multiple of the largest delay in the 95 % interval is replaced by the
+# delay
 MAX_LAG_RATIO = 4.0
 # Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05

@@ -1,10 +1,13 @@
-"""GNSS fixes that EKF2 used and that only EKF2's own topics contain."""
+"""Reconstruction of GNSS fixes that EKF2 used but that are not logged."""
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.common import interpolate_inside
+from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
@@ -13,6 +16,18 @@ MAX_SAME_FIX_S = 0.01
 # Maximum difference (°, about 100 km) of observed and logged latitude: a larger difference shows
 # that the observation is in m
 MAX_LATITUDE_DISTANCE_DEG = 1.0
+# Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
+FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
+# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval: half of an
+# EKF2 prediction interval, plus clock jitter
+MAX_MULTIPLE_ERROR_S = 0.006
+# Minimum number of logged fixes to measure the error of reconstructed fixes
+MIN_LOGGED_FIXES = 10
+# Minimum number of logged intervals of n, and of n + 1, receiver intervals for an estimate of the
+# receiver interval
+MIN_REPEATED_INTERVALS = 3
+# Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
+MAX_RECONSTRUCTION_ERROR_M = 0.1
 
 
 def read_unlogged_fixes(
@@ -49,3 +64,91 @@ def read_unlogged_fixes(
         < MAX_LATITUDE_DISTANCE_DEG
     )
     return unlogged_fixes if is_in_degrees else pd.DataFrame()
+
+
+def reconstruct_fixes(
+    fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
+) -> tuple[pd.DataFrame, str]:
+    """Reconstruct unlogged fixes as EKF2 position plus innovation (PX4 up to v1.15).
+
+    Return the fixes, with interpolated heights, and a note; both are empty if the error at logged
+    fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
+
+    Parameters
+    ----------
+    fixes : DataFrame
+        Logged fixes (m, NED) and variances, indexed by the measurement time that EKF2 assumes.
+    delay_s : float
+        Delay from measurement to timestamp that EKF2 assumes.
+    """
+    no_fixes = pd.DataFrame(columns=fixes.columns), ""
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
+        return no_fixes
+    gnss_innovations = with_gnss_innovations(ekf2).innovations
+    north, east = gnss_innovations["north"], gnss_innovations["east"]
+    fix_s = fixes.index.to_numpy()
+    interval_s = _interval_s(fix_s)
+    if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
+        return no_fixes
+    # EKF2 fuses a fix older than the fusion horizon at the horizon (RingBuffer.h)
+    delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
+    fused_s = north.index.to_numpy() - delay_beyond_horizon_s
+    # An innovation, logged at 2 Hz, belongs to the last fix before it, which is a whole number of
+    # receiver intervals after a logged fix. If the number is 0, the fix itself is logged
+    previous_fix = np.searchsorted(fix_s, fused_s) - 1
+    intervals_passed = (fused_s - fix_s[previous_fix]) / interval_s
+    is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
+    # Skip innovations logged within one EKF2 step of a fix: they may belong to this fix or to the
+    # previous fix
+    is_used = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / interval_s)
+    previous_fix = previous_fix[is_used]
+    intervals_passed = np.floor(intervals_passed[is_used])
+    fix_time_s = fix_s[previous_fix] + intervals_passed * interval_s
+    reconstructed = pd.DataFrame(
+        {
+            column: interpolate_inside(fix_time_s + delay_beyond_horizon_s, ekf2.state[column])
+            + innovations["innovation_m"].to_numpy()[is_used]
+            for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
+        },
+        index=time_index(fix_time_s),
+    )
+    is_logged = intervals_passed == 0.0
+    error = reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix]
+    error = error[is_logged].dropna()
+    reconstructed = reconstructed[~is_logged].dropna()
+    reconstructed = reconstructed[~reconstructed.index.duplicated()]
+    if len(error) < MIN_LOGGED_FIXES or reconstructed.empty:
+        return no_fixes
+    error_m = float(np.sqrt(np.mean(error.to_numpy() ** 2)))
+    if error_m > MAX_RECONSTRUCTION_ERROR_M:
+        return no_fixes
+    for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
+        if column in fixes:
+            reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
+    return reconstructed, (
+        f"{len(reconstructed)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
+        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)"
+    )
+
+
+def _interval_s(times: Array) -> float | None:
+    """Return the longest interval (s) of which all logged intervals are multiples.
+
+    Return None if all logged intervals are equal, because the multiple is then unknown.
+    """
+    logged_s = np.diff(times)[:, None]
+    multiples = logged_s / FIX_INTERVALS_S
+    multiple_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
+    worst_error_s = np.percentile(multiple_error_s, 98, axis=0)
+    possible_intervals = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
+    if not len(possible_intervals):
+        return None
+    longest_s = FIX_INTERVALS_S[possible_intervals[-1]]
+    # Use the interval with the smallest error within 10 % of the longest possible interval
+    near_intervals = np.flatnonzero(np.abs(FIX_INTERVALS_S - longest_s) < 0.1 * longest_s)
+    best_s = FIX_INTERVALS_S[near_intervals[np.argmin(worst_error_s[near_intervals])]]
+    interval_multiples = np.round(logged_s[:, 0] / best_s)
+    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
+    if not np.any(is_frequent[1:] & is_frequent[:-1]):
+        return None
+    return float(np.median(logged_s[:, 0] / interval_multiples))

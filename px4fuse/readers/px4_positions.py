@@ -37,7 +37,7 @@ from px4fuse.readers.common import (
 )
 from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import configured_step_s
-from px4fuse.readers.px4_fixes import read_unlogged_fixes
+from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
@@ -449,6 +449,11 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)"
         )
+    elif rate_hz < MAX_DOWNSAMPLED_HZ:
+        reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
+        if note:
+            samples = pd.concat([samples, reconstructed_fixes]).sort_index()
+            notes.append(note)
     track_fields: dict[str, Any] = {}
     # the lever arm of each receiver is logged since v1.17
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):
