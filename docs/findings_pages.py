@@ -43,7 +43,7 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
@@ -247,7 +247,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "The finding can be a consequence of: " + links(causes) + ".\n"
     if effects:
         yield "Possible consequences of the finding: " + links(effects) + ".\n"
-    if name in RECORDING:
+    if entry.role == "recording":
         yield "This finding is about the recording. It is listed before findings about noises.\n"
     if example is not None:
         finding = example.finding

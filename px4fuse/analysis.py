@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from px4fuse.comparison.causal_replays import Reruns
 from px4fuse.comparison.estimates import Estimates
 from px4fuse.comparison.flight_events import Events
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.comparison.reruns import Reruns
 from px4fuse.comparison.trials import Trial
 from px4fuse.core.notebook_display import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult

@@ -5,20 +5,19 @@
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
 5. estimate: noises, time offset, frame misalignment, biases
-6. intervene: re-run both filters with one change at a time
+6. rerun: re-run both filters with one change at a time
 7. find: faults of the flight, with their causes
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
 from msgspec import structs
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
@@ -36,7 +35,8 @@ from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
-from px4fuse.convention.correction import find_faults
+from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
+from px4fuse.convention.correction import convention_faults
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Model, open_model
@@ -53,21 +53,6 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
-
-# Parts of an analysis that px4fuse withholds from a flight that is an assignment
-WITHHELD_PARTS: dict[str, Any] = dict.fromkeys(
-    [
-        "clock",
-        "heading",
-        "bias_scale_jump_fit",
-        "source_low_pass",
-        "time_correlated_noise",
-        "ekf2_model",
-        "aids",
-        "loop",
-    ],
-    WITHHELD,
-)
 
 
 def diagnose(
@@ -107,22 +92,20 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     For a flight that is an assignment, the result contains only the comparison.
     """
     if comparison.flight.log.is_assessed:
-        return Analysis(
+        withheld_parts: dict[str, Any] = {
+            field.name: WITHHELD for field in fields(Analysis) if field.default is MISSING
+        }
+        known_parts = {
             **vars(comparison),
-            **WITHHELD_PARTS,
-            tuning={HORIZONTAL: WITHHELD},
-            difference_steps=dict.fromkeys(comparison.axes, WITHHELD),
-            trials=(),
-            events=collect_events(comparison),
-        )
+            "tuning": {HORIZONTAL: WITHHELD},
+            "difference_steps": dict.fromkeys(comparison.axes, WITHHELD),
+            "trials": (),
+            "events": collect_events(comparison),
+        }
+        return Analysis(**withheld_parts | known_parts)
     estimates = estimate(comparison, progress)
-    convention, clock = comparison.convention, estimates.clock
-    is_late = find_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
-    if convention and is_late and isinstance(clock, ClockOffset) and clock.is_determinable:
-        # this maximum-likelihood estimate is more precise than the offset of the convention check
-        convention = structs.replace(convention, late_s=-clock.offset_s)
-        comparison = replace(comparison, convention=convention)
-    reruns = intervene(comparison, estimates, progress)
+    comparison = refine_delay(comparison, estimates.clock)
+    reruns = rerun(comparison, estimates, progress)
     progress("measuring the loop closure error")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
@@ -136,6 +119,24 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
         loop=analyse_flight_loop(flight, progress),
     )
     return replace(analysis, findings=find(analysis))
+
+
+def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
+    """Replace a wrong delay from the convention check by the more precise time offset.
+
+    This changes the finding only. KF is not run again: :func:`prepare` has already subtracted the
+    delay of the check from the timestamps, and the re-runs try the rest (``clock.remaining_s``).
+    """
+    if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
+        return comparison
+    # a time offset is negative if the timestamps are late
+    refined = structs.replace(comparison.convention, late_s=-clock.offset_s)
+    # a refined delay that is too small for a finding would hide the correction of the timestamps
+    is_fault = all(
+        convention_faults(convention, comparison.flight, comparison.source.frame).late_s
+        for convention in (comparison.convention, refined)
+    )
+    return replace(comparison, convention=refined) if is_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -206,7 +207,7 @@ def prepare_comparison(
     return prepare(flight, request, as_sent=as_sent)
 
 
-def intervene(
+def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
     """Replay EKF2, explain the difference KF - EKF2, and re-run the filters without each error."""
@@ -220,7 +221,7 @@ def intervene(
         ],
     )
     difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
-    trials = run_interventions(comparison, estimates, model)
+    trials = rerun_filters(comparison, estimates, model)
     if isinstance(model, Model):  # frees memory; later replays are computed again
         model = replace(model, runs=(), intervals={})
     return Reruns(ekf2_model=model, difference_steps=difference_steps, trials=trials)

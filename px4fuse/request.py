@@ -1,6 +1,6 @@
 """Requests: files and settings of one analysis, for example parsed from a command line.
 
-The results contain the request, so that :func:`px4fuse.analysis.run` can repeat the analysis.
+The results contain the request, so that :func:`px4fuse.diagnose.diagnose` can repeat the analysis.
 """
 
 import os

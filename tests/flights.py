@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.estimates import Estimates, Tuning
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
+from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
@@ -348,7 +348,7 @@ def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysi
         tuning_by_axis=tune_by_axis(comparison),
         noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
-    trials = run_interventions(comparison, estimates, missing)
+    trials = rerun_filters(comparison, estimates, missing)
     return Analysis(
         **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, trials=trials,
         events=collect_events(comparison), aids=evaluate_aids(comparison.flight),

@@ -16,8 +16,10 @@ from flights import given_placement
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import Faults, find_faults
+from px4fuse.convention.correction import Faults, convention_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
+from px4fuse.diagnose import refine_delay
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
@@ -310,13 +312,28 @@ def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_de
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
         frames="FLU to ENU" if axes[2] == "up" else "FRD to NED"),
     )  # fmt: skip
-    assert find_faults(convention, fused(flown()), "NED") == expected
+    assert convention_faults(convention, fused(flown()), "NED") == expected
 
 
 def test_source_in_frame_frd_has_no_rotation_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
-    assert not find_faults(convention, flown(), "FRD")
-    assert find_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
+    assert not convention_faults(convention, flown(), "FRD")
+    assert convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
+
+
+@pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])
+def test_refined_delay_below_the_limit_keeps_the_finding(estimate_s, reported_s):
+    late = Convention(verdict="determined", late_s=0.52)
+    comparison = replace(compared(sent(flown())), convention=late)
+    clock = ClockOffset(
+        offset_s=estimate_s, interval_s=(estimate_s - 0.01, estimate_s + 0.01), sigma_s=0.005,
+        applied_s=-0.52, is_determinable=True, parts=(), count=100,
+    )  # fmt: skip
+    (found,) = source_convention.detect(refine_delay(comparison, clock))
+    assert found.id == "source_time_offset"
+    assert f"are {reported_s:.2f} s late" in found.message
+    unclear = replace(clock, is_determinable=False)
+    assert refine_delay(comparison, unclear) is comparison
 
 
 def test_ambiguous_source_axes_finding_lists_possible_axes():

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import POSITION_VARIANCES
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.reruns import POSITION_VARIANCES
 from px4fuse.comparison.trials import (
     ROTATION,
     explained_fraction,

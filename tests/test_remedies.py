@@ -9,9 +9,9 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
-from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
+from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.whatif import what_if
@@ -149,7 +149,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
         sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
     changed = replace(analysis, clock=clock)
-    trials = run_interventions(changed, changed, changed.ekf2_model)
+    trials = rerun_filters(changed, changed, changed.ekf2_model)
     return replace(changed, trials=trials)
 
 

@@ -14,8 +14,8 @@ from px4fuse.batch.measures import (
     collect_numbers,
 )
 from px4fuse.batch.rows import value_at
-from px4fuse.comparison.causal_replays import is_inconsistent
 from px4fuse.comparison.model import FilterSummary
+from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of

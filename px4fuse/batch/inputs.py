@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited, read_head
 from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
+from px4fuse.filter.settings import Settings
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
@@ -20,7 +21,7 @@ Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from the results of one input to analyse the log of the other input
-_FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
+_FILTER_FIELDS = (*Settings.__dataclass_fields__, "axes")
 # Settings that are copied only if both inputs belong to the same log
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 

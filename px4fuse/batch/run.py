@@ -34,7 +34,7 @@ from px4fuse.core.reading import max_log_bytes
 from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.core.writing import write_all
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.settings import requested_settings
 from px4fuse.request import ComparisonRequest, command_line
 
 # Table columns with the paths of the outputs of a log, relative to the output folder
@@ -189,9 +189,7 @@ def run(
         raise SettingsError(f"a setting is unknown ({error}).") from error
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
-    sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    # raises SettingsError if a setting is out of range
-    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)
+    requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
     log_by_address = {log.address: log for log in logs}

@@ -46,7 +46,7 @@ from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
-from px4fuse.filter.settings import SETTING_UNITS, Settings
+from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -553,7 +553,7 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
             origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):
             origin = "default"
-        texts.append(f"{label} {value:g} {SETTING_UNITS[name]} ({origin})")
+        texts.append(f"{label} {value:g} {SETTING_RANGES[name].unit} ({origin})")
     return ", ".join(texts)
 
 

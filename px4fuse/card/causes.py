@@ -33,45 +33,6 @@ from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
-# Kinds of re-runs (:attr:`Trial.kinds`) that test a finding, by id of the finding
-RERUN_KINDS: Mapping[str, frozenset[str]] = {
-    "source_time_offset": frozenset({"time offset", "delay"}),
-    "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
-    "source_outliers": frozenset({"outliers"}),
-    "source_frame_misaligned": frozenset({"rotation"}),
-    "ekf2_heading_error": frozenset({"rotation"}),
-    "accelerometer_bias": frozenset({"bias"}),
-    "sigma_a_too_small": frozenset({"noises"}),
-    "sigma_a_too_large": frozenset({"noises"}),
-    "sigma_z_too_small": frozenset({"noises"}),
-    "sigma_z_too_large": frozenset({"noises"}),
-    "process_noise_near_zero": frozenset({"noises"}),
-    "ekf2_gate_too_small": frozenset({"gate"}),
-    "ekf2_rejects_positions": frozenset({"noise", "gate"}),
-    "ekf2_noise_too_small": frozenset({"noise", "noises"}),
-    "ekf2_noise_too_large": frozenset({"noise", "noises"}),
-    "ekf2_overconfident": frozenset({"process noise"}),
-    "ekf2_underconfident": frozenset({"process noise"}),
-}
-# Ids of findings that make the verdicts meaningless, so they are the first causes on the card
-MEANINGLESS_VERDICT_FINDINGS = (
-    "log_damaged",
-    "not_px4",
-    "autopilot_restarted",
-    "imu_samples_missing",
-    "ekf2_not_fusing",
-    "parameter_changed",
-)
-# Ids of findings that only repeat a verdict on σ; the card lists them only if no other cause exists
-VERDICT_FINDINGS = frozenset(
-    {
-        "error_exceeds_reported_sigma",
-        "kf_overconfident",
-        "kf_underconfident",
-        "ekf2_overconfident",
-        "ekf2_underconfident",
-    }
-)
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 # Changes that shift KF and EKF2 together with the position source: only ground truth shows their
 # effect
@@ -118,7 +79,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.main_trials, finding)
-        if finding.id in VERDICT_FINDINGS:
+        if CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
@@ -127,7 +88,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         ranked_causes.append(
             RankedCause(finding, _cause_rank(finding, trials), sum(map(reduction, trials)), trials)
         )
-    faults = [cause for cause in ranked_causes if cause.finding.id not in VERDICT_FINDINGS]
+    faults = [cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"]
     return sorted(
         faults or ranked_causes,
         key=lambda cause: (
@@ -140,12 +101,12 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
 
 
 def _is_setting(finding: Finding) -> bool:
-    kinds = RERUN_KINDS.get(finding.id, frozenset())
+    kinds = CATALOGUE[finding.id].reruns
     return bool(kinds) and kinds <= SETTING_CHANGE_KINDS
 
 
 def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
-    if finding.id in MEANINGLESS_VERDICT_FINDINGS or CONVENTION in finding.evidence:
+    if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION in finding.evidence:
         return 0
     if _is_setting(finding) and any(map(remains_overconfident, trials)):
         return 3
@@ -158,7 +119,7 @@ def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
     """Return the best re-run of each filter and kind of change that tests a finding."""
-    kinds = RERUN_KINDS.get(finding.id, frozenset())
+    kinds = CATALOGUE[finding.id].reruns
     kinds |= {"defaults"} if "noises" in kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
@@ -279,7 +240,7 @@ def _no_change_reason(
     if not words:
         return ""
     if set(words.values()) == {"consistent"}:
-        if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_CHANGE_KINDS:
+        if "truth" not in words and CATALOGUE[finding.id].reruns & UNSEEN_CHANGE_KINDS:
             return "no change: the log has no ground truth, which would show this fault"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":

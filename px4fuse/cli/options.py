@@ -21,7 +21,7 @@ from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
-from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
+from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.request import (
     AUTO,
     DT_S,
@@ -284,21 +284,21 @@ filter_options = _combine_options(
         type=TypedQuantity("m/s²", SIGMA_A_M_S2),
         default=SIGMA_A_M_S2,
         help="KF process noise SIGMA_A: σ of the acceleration error over one step DT, {:g} to {:g} "
-        "m/s².".format(*SIGMA_A_RANGE_M_S2),
+        "m/s².".format(*SETTING_RANGES["sigma_a_m_s2"]),
     ),
     click.option(
         "--sigma-z",
         "sigma_z_m",
         type=TypedQuantity("m"),
         help="KF measurement noise SIGMA_Z: σ of a measured position, {:g} to {:g} m.  [default: "
-        "0.1; for GNSS √R of EKF2]".format(*SIGMA_Z_RANGE_M),
+        "0.1; for GNSS √R of EKF2]".format(*SETTING_RANGES["sigma_z_m"]),
     ),
     click.option(
         "--dt",
         "dt_s",
         type=TypedQuantity("s"),
         default=DT_S,
-        help="KF prediction interval DT, {:g} to {:g} s.".format(*DT_RANGE_S),
+        help="KF prediction interval DT, {:g} to {:g} s.".format(*SETTING_RANGES["dt_s"]),
     ),
     click.option(
         "--input",

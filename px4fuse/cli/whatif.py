@@ -83,9 +83,9 @@ def whatif(
         **option_values,
     )
     with outputs.progress(json_path) as show_progress:
-        counterfactual = run_what_if(request, show_progress)
-    results = whatif_results(request, counterfactual)
-    outputs.write_and_print(outputs.result_files(results, json_path), summary(counterfactual))
+        analysis = run_what_if(request, show_progress)
+    results = whatif_results(request, analysis)
+    outputs.write_and_print(outputs.result_files(results, json_path), summary(analysis))
 
 
 def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:

@@ -9,10 +9,10 @@ from msgspec import structs
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct_convention, find_faults
+from px4fuse.convention.correction import convention_faults, correct_convention
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
-from px4fuse.filter.settings import CLOCK_OFFSET_RANGE_S, SIGMA_Z_RANGE_M, Settings
+from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
@@ -34,7 +34,7 @@ from px4fuse.readers.px4_innovations import (
     with_gnss_innovations,
 )
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
-from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
+from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
@@ -61,21 +61,11 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     SettingsError
         A setting is out of range, the segment is empty, or required acceleration is missing.
     """
-    clock_offset_s = request.clock_offset_s
     for name in ("start_s", "end_s", "clock_offset_s"):
         value = getattr(request, name)
         if isinstance(value, float) and not math.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
-    settings = Settings(
-        sigma_a_m_s2=request.sigma_a_m_s2,
-        sigma_z_m=SIGMA_Z_M if request.sigma_z_m is None else request.sigma_z_m,
-        dt_s=request.dt_s,
-        input=request.input or "imu",
-        # align_position_file has already applied the time offset of a position file
-        clock_offset_s=clock_offset_s
-        if isinstance(clock_offset_s, float) and request.position is None
-        else 0.0,
-    )
+    settings = requested_settings(request)
     track, reason = choose_source(flight, request.position_source)
     if kind := request.source_kind:
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
@@ -85,9 +75,10 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     convention = None if is_withheld else check_convention(flight, track)
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
-    late_s = find_faults(convention, flight, track.frame).late_s
+    late_s = convention_faults(convention, flight, track.frame).late_s
     # a time offset beyond the range of the settings is found at the edge of the searched range
-    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *CLOCK_OFFSET_RANGE_S))
+    low_s, high_s, _ = SETTING_RANGES["clock_offset_s"]
+    clock_offset_s = min(max(settings.clock_offset_s - late_s, low_s), high_s)
     settings = replace(settings, clock_offset_s=clock_offset_s)
     flight, track = correct_convention(flight, track, convention)
     track = _move_to_vehicle(track, flight)
@@ -104,7 +95,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
     if track.origin.fused_as_gnss and request.sigma_z_m is None:
         default_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = observation_variance(flight, track, lines[0], segment, default_m) ** 0.5
-        if sigma_z_m >= SIGMA_Z_RANGE_M[0]:
+        if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):

@@ -38,6 +38,8 @@ SMALL_ROTATION = np.radians(8.0)
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION
 ROTATION_ODDS = -1.0
+# Log prior odds of a frame with a smaller estimated rotation, relative to a frame without rotation
+SMALL_ROTATION_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_OFFSET_S
 OFFSET_ODDS = -2.0
 # Log prior odds of a unit other than metres
@@ -46,6 +48,8 @@ UNIT_ODDS = -2.0
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent barometer heights
 BAROMETER_WEIGHT = 6.0
+# Larger height errors (m) count as this error: they are outliers
+MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED = 8
 # Hypotheses whose log likelihood is lower than the best one by more than this are not refined
@@ -369,22 +373,32 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 
 def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the log prior odds of a hypothesis, plus the log likelihood of its heights."""
+    """Return the log prior odds of a hypothesis, plus the log likelihood ratio of its heights."""
     log_odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
     log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:
+        # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
-        log_odds += ROTATION_ODDS if abs(hypothesis.remainder_rad) > SMALL_ROTATION else -0.5
-    if positions.barometer is None:
-        return log_odds
-    barometer = np.interp(positions.time_s - hypothesis.offset_s, *positions.barometer)
-    down = (
+        is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION
+        log_odds += ROTATION_ODDS if is_large else SMALL_ROTATION_ODDS
+    if positions.barometer is not None:
+        log_odds += _height_log_likelihood(hypothesis, positions, *positions.barometer)
+    return log_odds
+
+
+def _height_log_likelihood(
+    hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_m: Array
+) -> float:
+    """Return the log likelihood of the barometer heights, relative to a constant height."""
+    height_m = np.interp(positions.time_s - hypothesis.offset_s, time_s, barometer_m)
+    down_m = (
         UNITS[hypothesis.unit]
         * hypothesis.family.vertical_sign
         * positions.position_m[:, hypothesis.family.vertical_axis]
     )
-    error = down - np.median(down) + barometer - np.median(barometer)
-    square = float(np.mean(np.minimum(error**2, (20.0 * BAROMETER_SIGMA_M) ** 2)))
-    floor = BAROMETER_SIGMA_M**2
-    ratio = max(float(np.var(barometer)), floor) / max(square, floor)
-    return log_odds + 0.5 * BAROMETER_WEIGHT * float(np.log(ratio))
+    # the height is positive upwards, so its sum with the vertical position is constant
+    error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
+    error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
+    min_m2 = BAROMETER_SIGMA_M**2
+    variance_ratio = max(float(np.var(height_m)), min_m2) / max(error_m2, min_m2)
+    return 0.5 * BAROMETER_WEIGHT * float(np.log(variance_ratio))

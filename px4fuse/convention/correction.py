@@ -82,7 +82,7 @@ class Faults:
         return self != Faults()
 
 
-def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
+def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
     """Return the faults of a position source whose stated frame is ``frame``."""
     if convention is None:
         return Faults()
@@ -151,7 +151,7 @@ def correct_convention(
 
     If EKF2 fused the wrong positions, its attitude is replaced by that of the gyroscopes.
     """
-    faults = find_faults(convention, flight, track.frame)
+    faults = convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin

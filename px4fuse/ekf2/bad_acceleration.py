@@ -56,17 +56,18 @@ class BadAcceleration:
     def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval with the flag, per configuration; None without a flag.
 
-        To be called for successive intervals.
+        Each call continues the logged flag, so call it for successive intervals. If the flag is
+        set several times in an interval, only the last time counts.
         """
         if len(self.logged_since_s):
-            row = np.searchsorted(self.logged_since_s, end_s) - 1
-            has_begun = self.follows_log & (row >= 0)
-            self.since_s = np.where(has_begun, self.logged_since_s[row], self.since_s)
-            self.until_s = np.where(has_begun, self.logged_until_s[row], self.until_s)
+            last_row = np.searchsorted(self.logged_since_s, end_s) - 1
+            has_begun = self.follows_log & (last_row >= 0)
+            self.since_s = np.where(has_begun, self.logged_since_s[last_row], self.since_s)
+            self.until_s = np.where(has_begun, self.logged_until_s[last_row], self.until_s)
         if not (self.until_s > begin_s).any():
             return None
-        duration_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
-        return np.asarray(np.maximum(duration_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
+        overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
+        return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_ratios: Array, ratios: Array) -> None:
         """Update the modelled flag after all fusions of one event.

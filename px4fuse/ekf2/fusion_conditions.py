@@ -45,12 +45,15 @@ SYNCHRONISE = (
     "MAVLink. Send microseconds."
 )
 # Age that EKF2 computes for positions whose timestamps are from a wrong clock or in a wrong unit
-STAMP_FAULTS = {
-    **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
+WRONG_CLOCKS = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
     ),
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
+}
+STAMP_FAULTS = {
+    **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
+    **WRONG_CLOCKS,
     "nanoseconds": "in the future",
 }
 # GNSS checks (by bit of gps_check_fail_flags) with the parameter and unit of the limit
@@ -193,13 +196,14 @@ def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
     if clock_map and (clock := clock_map.clock) in STAMP_FAULTS:
         yield UnmetCondition(
             "clock",
-            f"the timestamps are {clock if clock == '0' else f'in {clock}'}",
+            "the timestamps are " + ("0" if clock == "0" else f"in {clock}"),
             "EKF2 reads timestamp_sample in microseconds since the autopilot's boot. For EKF2 the "
             f"positions are {STAMP_FAULTS[clock]}.",
-            SYNCHRONISE if "UNIX" in clock or "clock" in clock else SET_TIMESTAMP,
+            SYNCHRONISE if clock in WRONG_CLOCKS else SET_TIMESTAMP,
         )
     if "age_s" not in status:
         return
+    # EKF2 subtracts the delay from each timestamp; age_s is arrival time minus timestamp
     delay_s = attempt.parameters.get(attempt.aid.delay, 0.0) * 1e-3
     age_s = float(attempt.samples_in_span(status)["age_s"].median()) + delay_s
     if -age_s > BUFFER_COUNT * attempt.interval_s:
@@ -212,9 +216,10 @@ def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
     if age_s > attempt.horizon_s + MAX_LATENESS_S:
         action = SYNCHRONISE
         if age_s < MAX_HORIZON_S:
+            max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # rounded up to a multiple of 50 ms
             action = (
                 "Check the clock of the positioning system. Then set EKF2_DELAY_MAX to "
-                f"{50.0 * np.ceil(20.0 * age_s):.0f} ms (v1.15 and later)."
+                f"{max_delay_ms:.0f} ms (v1.15 and later)."
             )
         yield UnmetCondition(
             "age",

@@ -124,14 +124,18 @@ class VisionFilter:
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the vision updates of one filter configuration at measurement times.
+        """Return the vision updates of one filter configuration, in the order of fusion.
 
-        ``end_s`` is the time of each event.
+        The index is the time of measurement; ``end_s`` is the time of each event.
         """
         update_log = self.update_log[..., configuration_index]
-        event, slot = np.nonzero(np.isfinite(update_log[:, :, 0]))
-        index = pd.Index(self.measured_at_s[slot, event, configuration_index], name="time_s")
-        updates = pd.DataFrame(update_log[event, slot], index, UPDATE_COLUMNS[:7])
+        measured_at_s = self.measured_at_s[..., configuration_index].T
+        has_innovation = np.isfinite(update_log[:, :, 0])
+        index = pd.Index(measured_at_s[has_innovation], name="time_s")
+        updates = pd.DataFrame(
+            update_log[has_innovation], index, UPDATE_COLUMNS[: update_log.shape[-1]]
+        )
+        event, _ = np.nonzero(has_innovation)
         return updates.assign(fused_at_s=end_s[event])
 
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:

@@ -18,9 +18,7 @@ from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
-    DT_RANGE_S,
-    SIGMA_A_RANGE_M_S2,
-    SIGMA_Z_RANGE_M,
+    SETTING_RANGES,
     Settings,
 )
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
@@ -79,9 +77,9 @@ def replay_signals(comparison: Comparison, packer: Packer) -> Data:
 def ranges() -> Data:
     """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
     return {
-        "sigma-a": list(SIGMA_A_RANGE_M_S2),
-        "sigma-z": list(SIGMA_Z_RANGE_M),
-        "dt": list(DT_RANGE_S),
+        "sigma-a": SETTING_RANGES["sigma_a_m_s2"][:2],
+        "sigma-z": SETTING_RANGES["sigma_z_m"][:2],
+        "dt": SETTING_RANGES["dt_s"][:2],
         "lesson": _settings_data(Settings()),
         "bands": CONSISTENT_RATIOS,
         "ends": list(AXIS_ENDS),

@@ -6,7 +6,7 @@ const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const inflate = (text) => new Response(new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))])
   .stream().pipeThrough(new DecompressionStream("deflate")));
 const Engine = (() => {
-  const SAME_TIME_S = 5e-7; // kalman.SAME_TIME_S
+  const SAME_TIME_S = 5e-7; // steps.MAX_SAME_TIME_S
   const MIN_MEASUREMENTS = 3; // signals.MIN_MEASUREMENTS
   const MIN_COMMON_SAMPLES = 3; // projection.MIN_COMMON_SAMPLES
   const MIN_INNOVATIONS = 10; // consistency.MIN_INNOVATIONS

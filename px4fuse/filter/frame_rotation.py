@@ -177,22 +177,26 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 
 def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
-    """Average rotation and σ (rad) over parts of equal duration; convert to degrees."""
+    """Average rotation and σ (rad) over parts of equal duration; convert to degrees.
+
+    Parts with fewer than ``MIN_PART_SAMPLES`` samples are omitted. Errors are correlated, so σ of
+    a mean is the RMS of the samples' σ.
+    """
     # parts of a long, downsampled track may exceed PART_LENGTH_S, to contain enough samples
     count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
-    edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1], count + 1)[1:-1])
-    part_rows = [
-        rows for rows in np.split(np.arange(len(time_s)), edges) if len(rows) >= MIN_PART_SAMPLES
-    ]
-    part_ends = [time_s[rows[[0, -1]]].tolist() for rows in part_rows]
-    part_means = [
-        np.degrees([rotation_rad[rows].mean(), np.sqrt(np.mean(sigma_rad[rows] ** 2))]).tolist()
-        for rows in part_rows
-    ]
+    part_edges_s = np.linspace(time_s[0], time_s[-1], count + 1)[1:-1]
+    rows_of_parts = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
-        HeadingPart(*span, *mean) for span, mean in zip(part_ends, part_means, strict=True)
+        HeadingPart(
+            start_s=float(time_s[rows[0]]),
+            end_s=float(time_s[rows[-1]]),
+            heading_error_deg=float(np.degrees(rotation_rad[rows].mean())),
+            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[rows] ** 2)))),
+        )
+        for rows in rows_of_parts
+        if len(rows) >= MIN_PART_SAMPLES
     )
 
 
@@ -220,8 +224,7 @@ def _compare_orientations(
         return None
     time_s = time_s[is_calm]
     rotation_rad = rotation_rad[is_calm]
-    # σ from differences of successive samples; averaging does not reduce it, because the errors are
-    # correlated
+    # σ from differences of successive samples
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
     part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)

@@ -1,21 +1,35 @@
 """Settings of KF (noises, prediction interval, input, time offset) with valid ranges."""
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import NamedTuple, get_args
 
 from px4fuse.errors import SettingsError
-from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
+from px4fuse.request import (
+    AUTO,
+    DT_S,
+    SIGMA_A_M_S2,
+    SIGMA_Z_M,
+    ComparisonRequest,
+    InputName,
+)
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Valid ranges of KF's settings; values outside are typing errors
-SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
-SIGMA_Z_RANGE_M = (1e-4, 100.0)
-DT_RANGE_S = (1e-3, 1.0)
-CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
-_RANGES = (SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M, DT_RANGE_S, CLOCK_OFFSET_RANGE_S)
-# Unit of each numeric setting
-SETTING_UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s": "s"}
+
+class Range(NamedTuple):
+    """Valid range of a numeric setting; a value outside is a typing error."""
+
+    low: float
+    high: float
+    unit: str
+
+
+SETTING_RANGES = {
+    "sigma_a_m_s2": Range(1e-4, 100.0, "m/s²"),
+    "sigma_z_m": Range(1e-4, 100.0, "m"),
+    "dt_s": Range(1e-3, 1.0, "s"),
+    "clock_offset_s": Range(-10.0, 10.0, "s"),
+}
 
 
 @dataclass(frozen=True)
@@ -48,7 +62,7 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for (name, unit), (low, high) in zip(SETTING_UNITS.items(), _RANGES, strict=True):
+        for name, (low, high, unit) in SETTING_RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:  # also True for NaN
                 raise SettingsError(
@@ -58,6 +72,15 @@ class Settings:
             raise SettingsError(
                 f"`input` {self.input} is not an input of KF: give {' or '.join(INPUT_NAMES)}."
             )
+
+
+def requested_settings(request: ComparisonRequest) -> Settings:
+    """Return the settings in the fields of a request with the same names; None is the default."""
+    values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
+    # "auto" is estimated later; the time offset of a position file is applied by its reader
+    if request.clock_offset_s == AUTO or request.position is not None:
+        del values["clock_offset_s"]
+    return Settings(**{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
-from px4fuse.findings.model import TITLES, group_by_root
+from px4fuse.findings.model import CATALOGUE, group_by_root
 
 # Key in Finding.evidence: kind of cause that a re-run has confirmed
 CAUSE = "cause"
@@ -32,66 +32,21 @@ GAP = "gap"
 GROUND = "never took off"
 # Key in Finding.evidence: wrong axes, unit, clock or orientation of the source
 CONVENTION = "convention"
-# Findings that make all estimates invalid, so they are listed first
-UNUSABLE = (
-    "imu_values_impossible",
-    "gyroscope_bias",
-    "ekf2_bias_at_limit",
-    "source_is_ekf2_estimate",
-    "source_two_senders",
-    "source_positions_rounded",
-    "source_lever_arm",
-    "source_height_only",
-    "source_relocalises",
-    "source_timestamps_shared",
-)
 # Key in Finding.evidence: time (s) of a position jump with an increment of reset_counter
 ANNOUNCED = "reset_at_s"
-WITHOUT = "source_without_position"
-MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
 # Findings that explain others only if their severity is above note
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
 # Effects whose action corrects their cause, too, so that either action is enough
 ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
-NOISES = frozenset(
-    (
-        *_KF_VARIANCES,
-        "ekf2_underconfident",
-        "ekf2_overconfident",
-        "sigma_a_too_large",
-        "sigma_a_too_small",
-        "sigma_z_too_large",
-        "sigma_z_too_small",
-        "process_noise_near_zero",
-    )
-)
 # Ids of the effects of each finding, one per line
 CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
-RECORDING = frozenset(
-    {
-        "autopilot_restarted",
-        "imu_gap",
-        "imu_samples_missing",
-        "acceleration_not_logged",
-        "log_damaged",
-        "logger_dropouts",
-        "imu_rate_too_low",
-        "source_begins",
-        "source_gap",
-        "source_gap_in_log",
-        "source_not_logged",
-        "source_samples_lost",
-        "source_stops",
-        "too_few_innovations",
-    }
-)
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings by severity; each cause is followed by its effects."""
-    ids = list(TITLES)
+    ids = list(CATALOGUE)
     groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
     for cause, effects in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
@@ -141,14 +96,10 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 
 def _report_rank(group: list[Finding]) -> int:
     cause = group[0]
-    is_first = CONVENTION in cause.evidence or cause.id in (
-        *UNUSABLE,
-        *MISLEADING,
-        WITHOUT,
-        "ekf2_not_aligned",
-    )
+    role = CATALOGUE[cause.id].role
+    is_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
     if is_first and cause.severity != "note":
         return -1
     # a damaged recording falsifies noise estimates, so it is listed before wrong noises
-    ranks = {"error": 2 * (cause.id in NOISES), "warning": 3 - 2 * (cause.id in RECORDING)}
+    ranks = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
     return ranks.get(cause.severity, 4)

@@ -16,7 +16,7 @@ from px4fuse.comparison.trials import (
     is_sufficient,
 )
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.settings import SETTING_UNITS
+from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.findings.model import format_percent, source_words
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -105,7 +105,7 @@ def format_shift(shift_s: float) -> str:
 def format_kf_settings(settings: Mapping[str, float]) -> str:
     """Format the action "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
     texts = (
-        f"{name[:7].upper()} to {value:g} {SETTING_UNITS[name]} "
+        f"{name[:7].upper()} to {value:g} {SETTING_RANGES[name].unit} "
         f"({COMPARISON_OPTIONS[name]} {value:g})"
         for name, value in sorted(settings.items())
     )
@@ -135,7 +135,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
                 else f"positions rotated by {value:+.0f}°{mean}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
-            label, unit = name[:7].upper(), SETTING_UNITS[name]
+            label, unit = name[:7].upper(), SETTING_RANGES[name].unit
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import ErrorAboveSigma, error_above_reported_sigma
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import (
     FILTERS,
@@ -19,6 +18,7 @@ from px4fuse.comparison.model import (
     FilterName,
     north_and_east,
 )
+from px4fuse.comparison.reruns import ErrorAboveSigma, error_above_reported_sigma
 from px4fuse.comparison.trials import Trial, find_cause
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -17,11 +18,29 @@ from px4fuse.flight.position_source import PositionKind
 
 
 class CatalogueEntry(Record, frozen=True):
-    """Title, meaning and group of a finding; ``group`` is one of :data:`GROUPS`."""
+    """Texts of a finding, and its place among other findings.
+
+    Attributes
+    ----------
+    group : str
+        One of :data:`GROUPS`.
+    role : str
+        "unusable": the source makes all estimates invalid; "misleading": some samples do. These and
+        "first" are listed first, "noise" after other errors, "recording" before other warnings.
+    verdict : str
+        "meaningless": the verdicts on the filters are meaningless, so the card shows this cause
+        first. "repeated": the finding only repeats a verdict, so the card shows it only without
+        another cause.
+    reruns : frozenset of str
+        Kinds of re-runs (``Trial.kinds``) that test the finding.
+    """
 
     title: str
     meaning: str
     group: str = "position source"
+    role: Literal["", "unusable", "misleading", "first", "noise", "recording"] = ""
+    verdict: Literal["", "meaningless", "repeated"] = ""
+    reruns: frozenset[str] = frozenset()
 
 
 # All findings by id; findings of equal severity are listed in this order

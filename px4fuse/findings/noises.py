@@ -10,12 +10,12 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import is_inconsistent
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
+from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
     can_improve,
@@ -25,7 +25,7 @@ from px4fuse.comparison.trials import (
     find_trials,
 )
 from px4fuse.core.text import format_factor, format_number, format_ratio
-from px4fuse.filter.settings import SETTING_UNITS, Settings
+from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.finding import SEVERITIES, Finding, Severity
@@ -176,7 +176,7 @@ def _setting_finding(
 
 
 def format_estimate(name: str, setting: float, noise: Noise) -> str:
-    label, unit = name[:7].upper(), SETTING_UNITS[name]
+    label, unit = name[:7].upper(), SETTING_RANGES[name].unit
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
     if noise.value is not None and noise.high:

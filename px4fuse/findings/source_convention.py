@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import UNITS
-from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
+from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, convention_faults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
@@ -20,7 +20,7 @@ from px4fuse.convention.texts import (
     format_axes,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
@@ -75,7 +75,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     """Remove the findings that are only effects of a wrong convention, except those about EKF2."""
     faults = _faults(analysis)
     root_findings = [item for item in findings if CONVENTION in item.evidence]
-    unusable = [item for item in findings if item.id in UNUSABLE]
+    unusable = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
     if unusable:
         root_findings = unusable
         findings = [
@@ -88,7 +88,9 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     elif faults.orientation == "copied" and not faults.of_positions:
         root_findings = []
     root_findings += [
-        item for item in findings if item.id in MISLEADING or ANNOUNCED in item.evidence
+        item
+        for item in findings
+        if CATALOGUE[item.id].role == "misleading" or ANNOUNCED in item.evidence
     ]
     if not root_findings:
         return [*findings]
@@ -112,7 +114,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
 
 
 def _faults(analysis: Comparison) -> Faults:
-    return find_faults(analysis.convention, analysis.flight, analysis.source.frame)
+    return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
 def _position_faults(

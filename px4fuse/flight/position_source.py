@@ -79,7 +79,10 @@ ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FRO
 
 
 def find_origin(kind: str, path: str) -> Origin:
-    return {(origin.kind, origin.path): origin for origin in ORIGINS}[kind, path]  # type: ignore[index]
+    origins = {(str(origin.kind), str(origin.path)): origin for origin in ORIGINS}
+    if (kind, path) not in origins:
+        raise ValueError(f"ORIGINS has no kind and path {(kind, path)}, only {list(origins)}")
+    return origins[kind, path]
 
 
 def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:

@@ -25,7 +25,8 @@ class Layout:
     topic: str = ""
     # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Field of each column that is read only if the topic contains it
+    # Field of each column that is read only if the topic contains it; not for MAVLink messages,
+    # because they contain all their fields
     optional: Mapping[str, str] = field(default_factory=dict)
     # Factor from field value to column value; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)

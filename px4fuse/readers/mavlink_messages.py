@@ -1,6 +1,6 @@
 """MAVLink messages that px4fuse reads: fields, units, coordinate frames, directions.
 
-To support another message with a position, add a row to ``mavlink_messages.toml``.
+To support another message with a position, add tables to ``mavlink_messages.toml``.
 """
 
 from collections.abc import Mapping
@@ -50,6 +50,8 @@ class PositionInput:
     # Name of the track for ``--position-source``
     name: str = ""
     kind: str = "uwb"
+    # Frame of the positions; "unknown": MAV_FRAME in the column frame_id, if the layout has it
+    frame: str = "unknown"
     # Field with the sender's time (µs)
     stamp: str = "time_usec"
     # Required MAV_ESTIMATOR_TYPE, if any
@@ -82,6 +84,8 @@ class FrameOfReference:
 
 _TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
+if names := [name for name, layout in LAYOUTS.items() if layout.optional]:
+    raise ValueError(f"mavlink_messages.toml: `optional` in {names}. Move its fields to `columns`.")
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)

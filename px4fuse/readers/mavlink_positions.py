@@ -86,7 +86,7 @@ def _read_track(
     if clock.to_boot is not None:
         boot_s = np.where(stamp_s > 0.0, clock.to_boot.at(stamp_s), np.nan)
     samples = recording.read(source.layout, rows, boot_s, name)
-    frame = "NED"
+    frame = source.frame
     if "frame_id" in samples and len(samples):
         # A track has one coordinate frame: the frame of the last sample, as in PX4
         reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))

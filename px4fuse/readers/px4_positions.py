@@ -176,12 +176,10 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     # Topics of EKF2 have one topic instance per EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
-    frame = "unknown"
+    frame = px4.TRACKS[name].frame
     for field, frame_names in px4.FRAMES.items():
-        if field in samples and len(samples):
+        if frame == "unknown" and field in samples and len(samples):
             frame = frame_names.get(int(samples[field].iloc[-1]), "unknown")
-    if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # EKF2 rotated the positions, but the field still contains the old frame
     if "published_us" in samples:
         published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
         samples["age_s"] = published_s - samples.index

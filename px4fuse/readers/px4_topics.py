@@ -28,6 +28,8 @@ class TrackSource:
     description: str
     # Action to log the track
     remedy: str
+    # Frame of the positions; "unknown": value of the topic's frame field (FRAMES), if it has one
+    frame: str = "unknown"
     # Keys of the possible layouts of its topic; empty without a topic
     layouts: tuple[str, ...] = ()
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
-from px4fuse.convention.correction import find_faults
+from px4fuse.convention.correction import convention_faults
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
@@ -66,7 +66,9 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = f"The offset changes during the flight: {offset_texts}."
     source = comparison.source
-    if drift := find_faults(comparison.convention, comparison.flight, source.frame).clock_drift:
+    if drift := convention_faults(
+        comparison.convention, comparison.flight, source.frame
+    ).clock_drift:
         advice["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * drift):.1f} % "
             f"{'fast' if drift > 0.0 else 'slow'}. The offset applies to the middle of the data."

@@ -11,7 +11,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import Page, halves
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
@@ -30,6 +30,8 @@ MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
+LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
+COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
 MAX_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
@@ -67,27 +69,32 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw both paths from above before the alignment, and the aligned path coloured by error."""
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     map_axes = list(MAP_AXES[frame])
-    right, up = (AXES_OF_FRAME[frame][index] for index in map_axes)
-    columns, estimate_handle = [], []
+    names = [AXES_OF_FRAME[frame][index] for index in map_axes]
+    left, right = halves()
+    unaligned_handles: dict[str, Artist] = {}
     if is_aligned:
-        columns.append(halves()[0])
-        axes = columns[-1].panel("Before alignment", "", MAP_HEIGHT, left=34.0)
+        axes = left.panel("Before alignment", "", MAP_HEIGHT, left=LABEL_MARGIN)
         for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
             plot_path(axes, position_m[:, map_axes], evaluation.time_s, label=label, **line_style)
-        style.set_map_axes(axes, right, up)
-        estimate_handle = axes.get_legend_handles_labels()[0][1:]
-        columns[-1].write_small(unaligned_sentence(evaluation))
-    columns.append(halves()[1])
+        style.set_map_axes(axes, *names)
+        unaligned_handles = _legend_handles(axes)
+        left.write_small(unaligned_sentence(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
+    axes = right.panel(title, "", MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, map_axes)
-    style.set_map_axes(axes, right, up)
-    columns[-1].write_small("Darker poses have a larger error; × marks the largest one.")
-    page.legend([*axes.get_legend_handles_labels()[0], *estimate_handle])
-    page.add_columns(*columns)
+    style.set_map_axes(axes, *names)
+    right.write_small("Darker poses have a larger error; × marks the largest one.")
+    # both maps contain the reference
+    page.legend([*(_legend_handles(axes) | unaligned_handles).values()])
+    page.add_columns(*[left] * is_aligned, right)
+
+
+def _legend_handles(axes: Axes) -> dict[str, Artist]:
+    handles, labels = axes.get_legend_handles_labels()
+    return dict(zip(labels, handles, strict=True))
 
 
 def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:

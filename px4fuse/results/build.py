@@ -91,16 +91,14 @@ def sync_results(
     return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
 
 
-def whatif_results(
-    request: WhatIfRequest, counterfactual: WhatIfAnalysis
-) -> contract.WhatIfResults:
-    whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
+def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
+    whatif_result, sweep_start = analysis.whatif, analysis.sweep_start
     return within_bounds(
         contract.WhatIfResults(
-            **_common_fields(contract.WHATIF_SCHEMA, request, counterfactual.flight),
+            **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
             agreement=whatif_result.agreement,
             evaluated_s=whatif_result.evaluated_s,
-            asked=counterfactual.uses_estimates,
+            asked=analysis.uses_estimates,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
             whatif=whatif_result.whatif[0] if sweep_start else None,

@@ -24,9 +24,9 @@ from comparisons import compare
 from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.estimates import estimate
 from px4fuse.comparison.flight_events import collect_events
+from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
@@ -216,7 +216,7 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     comparison = compare(flight, condition.settings, axes=("north", "east"))
     estimates = estimate(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
-    trials = run_interventions(comparison, estimates, model)
+    trials = rerun_filters(comparison, estimates, model)
     return Analysis(
         **vars(comparison), **vars(estimates), ekf2_model=model, difference_steps={},
         trials=trials, events=collect_events(comparison),

@@ -10,9 +10,9 @@ from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
+from px4fuse.comparison.reruns import (
     planned_configurations,
-    run_interventions,
+    rerun_filters,
 )
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
@@ -205,7 +205,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
-    rows = run_interventions(analysis, analysis, model)
+    rows = rerun_filters(analysis, analysis, model)
     tried = [one.change for one in find_trials(rows, "ekf2", "aisle")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
@@ -244,7 +244,7 @@ def test_filter_rerun_without_required_data_is_skipped() -> None:
     missing = Unavailable("it", "not known", "None.")
 
     def tried(model: Any = analysis.ekf2_model, **parts: Any) -> set[tuple[str, str]]:
-        rows = run_interventions(analysis, replace(analysis, **parts), model)
+        rows = rerun_filters(analysis, replace(analysis, **parts), model)
         return {(row.filter, name) for row in rows if row.discrepancies for name in row.change}
 
     assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}

@@ -136,7 +136,7 @@ class _Filter(NamedTuple):
         return None if self.model is None else self.model.inputs
 
 
-def run_interventions(
+def rerun_filters(
     comparison: Comparison, estimates: Estimates, model: Model | Unavailable
 ) -> tuple[Trial, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
@@ -169,7 +169,7 @@ def run_interventions(
 def planned_configurations(
     comparison: Comparison, estimates: Estimates, inputs: Inputs
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 parameter sets that :func:`run_interventions` will replay."""
+    """Return the EKF2 parameter sets that :func:`rerun_filters` will replay."""
     if not is_fused_source(comparison, inputs):
         return []
     flown = inputs.settings

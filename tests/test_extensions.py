@@ -1,0 +1,182 @@
+"""The lists of files to change in docs/built.md, followed on a copy of px4fuse."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY as ROOT
+
+from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.contract import ChosenSettings
+
+GUIDE = (ROOT / "docs" / "built.md").read_text(encoding="utf-8")
+EXTENSIONS = GUIDE.partition("## Extensions\n")[2].partition("\n**Changed texts")[0]
+TABLES = [
+    textwrap.dedent(block) for block in re.findall(r"```toml\n(.*?)```", EXTENSIONS, re.DOTALL)
+]
+# A finding, a page and a command as short as the lists allow
+NEW_FILES = {
+    "findings/wind.py": """
+from px4fuse.findings.model import note
+
+
+def detect(analysis):
+    yield note("wind", "There was wind.", "Fly indoors.")
+""",
+    "report/wind.py": """
+from px4fuse.report.page import Page
+
+
+def draw(content, results):
+    yield Page("Wind page")
+""",
+    "cli/wind.py": """
+import click
+
+
+@click.command()
+def wind():
+    \"\"\"Print the wind.\"\"\"
+    click.echo("calm")
+""",
+}
+CATALOGUE_ENTRY = '\n[wind]\ntitle = "Wind"\nmeaning = "Wind."\nrole = "noise"\n'
+CHECKS = {
+    "ulog": """
+from pathlib import Path
+from ulog_tools import make_log, position, seconds_of, stamps, topic
+from px4fuse.readers import read_log
+at = stamps(10.0, 20.0)
+fields = dict(zip("xyz", position(seconds_of(at)).T, strict=True))
+log = make_log().add(topic("beacon_position", at, fields))
+tracks = {track.name: track for track in read_log(log.write(Path("wind.ulg"))).positions}
+assert tracks["beacon_position"].frame == "NED", tracks
+assert len(tracks["beacon_position"].samples) == 200
+""",
+    "mavlink": """
+from pathlib import Path
+from mavlink_tools import Aisle, COMPANION, message, unix, us, xyz
+from px4fuse.readers import read_log
+aisle = Aisle(uwb=None)
+recorder = aisle.record()
+for boot_s in aisle.times(5.0):
+    fields = xyz(aisle.path(boot_s)[0])
+    sent = message("VICON_POSITION_ESTIMATE", usec=us(unix(boot_s)), **fields)
+    recorder.hear(unix(boot_s + 0.01), COMPANION, sent)
+Path("wind.tlog").write_bytes(recorder.tlog())
+(track,) = read_log(Path("wind.tlog")).positions
+assert (track.name, track.frame, track.origin.kind) == ("VICON_POSITION_ESTIMATE", "NED", "mocap")
+assert len(track.samples) == 200
+""",
+    "finding, page": """
+from comparisons import compare
+from flights import aisle_flight, unexplained
+from px4fuse.findings import find
+from px4fuse.report.pdf import PAGES
+from px4fuse.results.contract import ComparisonResults
+assert [item.title for item in find(unexplained(compare(aisle_flight()))) if item.id == "wind"]
+pages = [page for draw in PAGES[ComparisonResults][-1:] for page in draw(None, None)]
+assert "Wind page" in repr(pages[0].blocks)
+""",
+    "command": """
+import sys
+from px4fuse.cli import cli
+sys.argv = ["px4fuse", "wind"]
+cli.main(standalone_mode=False)
+""",
+}
+
+
+def change(path: Path, edit: Callable[[str], str]) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert edit(text) != text
+    path.write_text(edit(text), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a copy of px4fuse that was extended by the lists."""
+    folder = tmp_path_factory.mktemp("extended")
+    package = folder / "px4fuse"
+    shutil.copytree(ROOT / "px4fuse", package, ignore=shutil.ignore_patterns("__pycache__"))
+    source, message = TABLES
+    change(package / "readers" / "px4_topics.toml", lambda text: text + "\n" + source)
+    change(
+        package / "readers" / "mavlink_messages.toml",
+        lambda text: re.sub(r"(?m)^VICON_POSITION_ESTIMATE = .*\n", "", text) + "\n" + message,
+    )
+    for name, text in NEW_FILES.items():
+        (package / name).write_text(text, encoding="utf-8")
+    change(
+        package / "findings" / "__init__.py",
+        lambda text: text.replace("    source_values,\n", "    source_values,\n    wind,\n"),
+    )
+    change(package / "findings" / "catalogue.toml", lambda text: text + CATALOGUE_ENTRY)
+    change(
+        package / "report" / "pdf.py",
+        lambda text: text.replace("    provenance,\n", "    provenance,\n    wind,\n").replace(
+            "        provenance.draw,\n    ),",
+            "        provenance.draw,\n        wind.draw,\n    ),",
+            1,
+        ),
+    )
+    change(
+        package / "cli" / "__init__.py",
+        lambda text: text.replace(
+            "COMMANDS = {\n", 'COMMANDS = {\n    "wind": "Print the wind.",\n'
+        ),
+    )
+    return folder
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kind", CHECKS)
+def test_extension_by_documented_files_works(kind: str, extended: Path) -> None:
+    paths = os.pathsep.join(map(str, (extended, ROOT / "tests")))
+    run = subprocess.run(
+        [sys.executable, "-c", CHECKS[kind]],
+        cwd=extended, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert kind != "command" or run.stdout == "calm\n"
+
+
+def test_extension_lists_name_existing_files_and_objects() -> None:
+    paths = set(re.findall(r"`((?:\w+/)*\w+\.(?:py|toml|md|js))`", EXTENSIONS))
+    texts = {}
+    for path in paths:
+        (file,) = [root / path for root in (ROOT, ROOT / "px4fuse") if (root / path).is_file()]
+        texts[path] = file.read_text(encoding="utf-8")
+    assert len(paths) > 30
+    for path, names in {
+        "tests/test_findings.py": ["FAULTS"],
+        "tests/test_options.py": ["CHANGED"],
+        "findings/model.py": ["class CatalogueEntry"],
+        "filter/settings.py": ["class Settings", "SETTING_RANGES"],
+        "results/contract.py": ["class ChosenSettings"],
+        "flight/position_source.py": ["ORIGINS"],
+        "report/pdf.py": ["PAGES"],
+        "cli/__init__.py": ["COMMANDS"],
+    }.items():
+        for name in names:
+            assert name in texts[path]
+            assert name.split()[-1] in EXTENSIONS
+
+
+def test_setting_of_kf_is_in_request_ranges_and_results() -> None:
+    names = set(Settings.__dataclass_fields__)
+    assert names <= set(ComparisonRequest.__struct_fields__)
+    assert names <= set(ChosenSettings.__struct_fields__)
+    assert set(SETTING_RANGES) == {
+        name for name in names if isinstance(getattr(Settings(), name), float)
+    }
