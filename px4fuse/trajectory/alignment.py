@@ -22,10 +22,10 @@ MIN_EXTENT_FRACTION = 1e-6
 # Minimum extent (m, RMS) of a motion that determines a rotation
 MIN_EXTENT_M = 1e-6
 # Maximum ratio of the residual to the horizontal motion for an estimate of yaw: noise alone has √2
-MAX_PLANE_RATIO = 1.0
+MAX_YAW_RESIDUAL_RATIO = 1.0
 # Maximum ratio of the residual to the motion perpendicular to the main direction for an estimate of
 # the full rotation: noise alone has √6
-MAX_LINE_RATIO = 2.0
+MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
 class Transform(Record, frozen=True):
@@ -157,14 +157,14 @@ def _require_determined(
         )
         residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
         length = float(np.linalg.norm(reference_extents))
-        limit = MAX_PLANE_RATIO
+        limit = MAX_YAW_RESIDUAL_RATIO
         motion_text = "horizontal motion"
         alternative = "none"
     else:
         # motion along a line does not determine the rotation around the line
         length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
-        limit = MAX_LINE_RATIO
+        limit = MAX_ROTATION_RESIDUAL_RATIO
         motion_text = "motion perpendicular to the main direction"
         alternative = "yaw or none"
     if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:

@@ -61,7 +61,7 @@ def find_frozen_poses(
     return is_frozen, tuple(warnings)
 
 
-def has_other_body(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
+def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
     """Return True if the orientations are of different body axes, such as those of a camera."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False

@@ -24,7 +24,7 @@ from px4fuse.trajectory.artefacts import (
     ITERATIONS,
     drop_constant_orientation,
     find_frozen_poses,
-    has_other_body,
+    has_other_body_axes,
 )
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
@@ -163,7 +163,7 @@ def evaluate(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
     aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
-    if not notes and has_other_body(aligned_estimate, matched_reference):
+    if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
         )

@@ -28,7 +28,7 @@ _FLOAT_EPSILON = float(np.finfo(float).eps)
 # Tolerance in the intermediate stages of graduated non-convexity, which need less precision
 _STAGE_TOLERANCE = 1e-6
 # Maximum number of iterations in an intermediate stage of graduated non-convexity
-_STAGE_ITERATIONS = 20
+_MAX_STAGE_ITERATIONS = 20
 
 # Probability that the squared residual of a true closure is not truncated
 GNC_PROBABILITY = 0.99
@@ -222,7 +222,9 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
             # avoids a division by zero; the weight is 1 anyway
             ratio = np.maximum(state.chi2 / bound, 1e-200)
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
-            stage_minimum = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
+            stage_minimum = _minimise(
+                graph, state, weights, _STAGE_TOLERANCE, _MAX_STAGE_ITERATIONS
+            )
             state = stage_minimum.state
             iteration_count = iteration_count + stage_minimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
