@@ -21,7 +21,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
-from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
 # Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
 CorrectionName = Literal[
@@ -144,7 +144,7 @@ class Loop(Record, frozen=True, kw_only=True):
     """
 
     track: str
-    kind: Kind
+    kind: TrajectoryKind
     frame: Frame
     start_s: float
     end_s: float

@@ -31,7 +31,7 @@ from px4fuse.readers.ros_bag import is_bag
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
-from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, TrajectoryKind
 
 TrackName = Literal["vio", "ekf2", "kf", "truth"]
 TRACK_NAMES: tuple[TrackName, ...] = get_args(TrackName)
@@ -118,7 +118,7 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
 
 def _make_trajectory(
     flight: Flight,
-    track_name: Kind,
+    track_name: TrajectoryKind,
     position_samples: pd.DataFrame,
     orientation: pd.DataFrame | Unavailable | None,
     notes: tuple[str, ...],
