@@ -19,11 +19,11 @@ from exchange import replace
 from forgery import (
     Change,
     VerifiedReport,
-    attached_results,
     forged,
     make_verified_report,
     on_page,
     read_again,
+    read_attached_results,
     set_value,
 )
 from results_tools import LOOP, changed_results, decode_results
@@ -133,7 +133,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 @pytest.fixture(scope="module")
 def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     verdict = flight.honest.verified(flight.honest.pdf)
-    return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
+    return flight.graded(read_attached_results(flight.honest.pdf), verdict, rubric)
 
 
 def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedReport) -> None:
@@ -302,11 +302,11 @@ def test_grade_of_pdf_with_overpainted_page_uses_log_results(
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
-    graded = flight.graded(attached_results(pdf), verdict, rubric)
+    graded = flight.graded(read_attached_results(pdf), verdict, rubric)
     assert graded.status == "page differs"
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
-        strict = flight.graded(attached_results(pdf), verdict, replace(rubric, pages=rule))
+        strict = flight.graded(read_attached_results(pdf), verdict, replace(rubric, pages=rule))
         assert strict.counted_points == counted
 
 

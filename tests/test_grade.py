@@ -97,7 +97,7 @@ def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).reports
     assert only.status == "cannot verify"
-    assert only.instructor_action.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.instructor_action.startswith("Ask the author of the report for the PDF")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 

@@ -26,7 +26,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_UPDATES,
+    GATE_QUESTION_UPDATES,
     PREDICTION_RANGES,
     FormQuestion,
     Prediction,
@@ -265,7 +265,7 @@ def quantity_truth(
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: GATE_UPDATES + 1] > question.duration_or_gate**2
+            is_outside = nis.iloc[: GATE_QUESTION_UPDATES + 1] > question.duration_or_gate**2
             outside_numbers = np.flatnonzero(is_outside) + question.update
             return tuple(outside_numbers.astype(float).tolist())
         case "prediction":

@@ -26,7 +26,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.loop.model import CorrectedPath, CorrectionName, Loop
 from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
-    TUNED_FIELDS,
+    ESTIMATE_FIELD_BY_SETTING,
     ComparisonResults,
     ReportedResults,
     to_plain,
@@ -337,7 +337,9 @@ class TuningItem(RubricItem, frozen=True, tag="tuning"):
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
         horizontal_tuning = comparison.tuning.get(HORIZONTAL)
-        interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[self.setting]}_interval", None)
+        interval = getattr(
+            horizontal_tuning, f"{ESTIMATE_FIELD_BY_SETTING[self.setting]}_interval", None
+        )
         if interval is None or interval[1] is None:
             reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."

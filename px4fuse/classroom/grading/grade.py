@@ -19,7 +19,7 @@ from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_bounded
 from px4fuse.errors import ResultsError
 
-FAILED_REMEDY = "Do not open the file. Ask for the PDF that px4fuse wrote."
+FAILED_REMEDY = "Do not open the file. Ask the student for the PDF that px4fuse wrote."
 
 
 @dataclass(frozen=True)
