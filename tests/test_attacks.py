@@ -28,7 +28,7 @@ from forgery import (
 )
 from results_tools import LOOP, changed_results, decode_results
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import form_truth
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
@@ -124,8 +124,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     (sha256,) = honest.files
     truth = form_truth(simulation, sha256)
     answers = (
-        Answer("s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth),
-        Answer("s02", "Bob", "s02.ulg", "b" * 64),
+        RightAnswers(
+            "s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth
+        ),
+        RightAnswers("s02", "Bob", "s02.ulg", "b" * 64),
     )
     return Flight(honest, AnswerKey("aisle", answers))
 
@@ -328,7 +330,9 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
-    key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
+    key = truth and AnswerKey(
+        "loop", (RightAnswers("s01", "", "", LOOP["track"]["sha256"], *truth),)
+    )
     verdict = Verification("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)

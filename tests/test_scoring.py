@@ -18,7 +18,7 @@ from results_tools import (
     finding,
 )
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.classroom.grading.model import Entry, GradedReport
@@ -169,8 +169,8 @@ TRUTH = FormTruth(
 
 
 def key(*mistakes, sha256=SHA, **values):
-    answer = Answer("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
-    other = Answer("s02", "Bob", "s02.ulg", "b" * 64)
+    answer = RightAnswers("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
+    other = RightAnswers("s02", "Bob", "s02.ulg", "b" * 64)
     return AnswerKey("aisle", (answer, other))
 
 

@@ -53,14 +53,14 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     for report in reports:
         if report.instructor_action:
             continue
-        for place, prefix, items in (
+        for group_index, prefix, items in (
             (0, "", report.items),
             (1, "Answer form: ", report.form_parts),
         ):
             total = sum(item.points for item in items)
             for item in items:
-                row = item.points, item.max_points, total - item.points
-                rows_by_item[place, f"{prefix}{item.title}"].append(row)
+                item_row = item.points, item.max_points, total - item.points
+                rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
         for kind, is_named in report.mistakes.items():
             rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []

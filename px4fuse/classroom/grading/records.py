@@ -110,8 +110,12 @@ def _dependencies(
 ) -> dict[str, str]:
     """Return the version of each library, and the availability of each input file by SHA-256."""
     return _versions() | {
-        name: "available" if name in logs else "assigned" if name in assigned_hashes else "missing"
-        for name in sorted(set(file_hashes_in(results)))
+        sha256: "available"
+        if sha256 in logs
+        else "assigned"
+        if sha256 in assigned_hashes
+        else "missing"
+        for sha256 in sorted(set(file_hashes_in(results)))
     }
 
 
