@@ -131,9 +131,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     change(
         package / "cli" / "__init__.py",
-        lambda text: text.replace(
-            "COMMANDS = {\n", 'COMMANDS = {\n    "wind": "Print the wind.",\n'
-        ),
+        lambda text: text.replace("COMMANDS = (\n", 'COMMANDS = (\n    "wind",\n'),
     )
     return folder
 
