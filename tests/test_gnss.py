@@ -322,10 +322,10 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
         ("source_gap", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
     "v1.13.3_gps_profile1":
         (None, {"gnss_pos": "consistent", "gnss_vel": "consistent"},
-         "GNSS is logged at 2.0 Hz"),
+         "GNSS is logged at 3.0 Hz"),
     "v1.14.4_gps_magdist":
         ("aid_innovation_shift", {"gnss_pos": "consistent", "mag": "biased"},
-         "GNSS is logged at 2.0 Hz"),
+         "GNSS is logged at 3.4 Hz"),
     "v1.16.1_gps_delay0":
         ("source_time_offset", {"gnss_pos": "consistent", "gnss_vel": "consistent"}, ""),
     "v1.16.1_gps_fullrate": (None, {"gnss_pos": "consistent", "gnss_hgt": "consistent"}, ""),
@@ -336,6 +336,8 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "v1.16.1_gps_stock_flow":
         (None, {"gnss_pos": "underconfident", "rng_hgt": "underconfident"}, ""),
 }  # fmt: skip
+# Minimum number of fixes reconstructed from innovations in flights logged at 2 Hz
+FROM_INNOVATIONS = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
 STAMP_S = 0.016  # s, simulation steps of 8 ms from a fix to its timestamp and to the filter
 OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
@@ -368,6 +370,14 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
     assert not reason or re.search(reason, analysis.ekf2_model.reason)
     assert verdicts == {aid: analysis.aids[aid].verdict for aid in verdicts}
     assert as_in_the_log(analysis.aids, truth) >= 2
+    if name in FROM_INNOVATIONS:
+        track = track_of(analysis.flight)
+        assert "2.0" in track.notes[0]
+        pattern = r"^(\d+) unlogged GNSS fixes.*RMS error ([\d.]+) m"
+        count, exact_m = re.findall(pattern, track.notes[1])[0]
+        assert int(count) > FROM_INNOVATIONS[name]
+        assert float(exact_m) < 0.1
+        assert track.rate_hz > 2.9
 
 
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
@@ -428,10 +438,10 @@ def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
         rejecting.rejected_fraction_logged, abs=0.01
     )
     for axis in (*rejecting.gnss_pos.values(), *rejecting.gnss_vel.values()):
-        assert axis.innovation_correlation > 0.999
+        assert axis.innovation_correlation > 0.997
         assert axis.s_ratio_p5 > 0.998
         assert axis.s_ratio_p95 < 1.004
-        assert axis.position_rms_difference_m < 0.02
+        assert axis.position_rms_difference_m < 0.04
 
 
 @pytest.mark.reallogs

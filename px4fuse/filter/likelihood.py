@@ -188,18 +188,20 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     return (0.5 * (left_value - right_value) / curvature if curvature > 0.0 else 0.0), curvature
 
 
-def profile_interval(grid: Array, profile: Array) -> tuple[float | None, float | None]:
+def profile_interval(
+    grid: Array, profile: Array, max_drop: float = PROFILE_DROP
+) -> tuple[float | None, float | None]:
     """Return the 95 % interval of a parameter from its negative log-likelihood on a grid.
 
-    An end outside the grid is None.
+    An end outside the grid is None. ``max_drop`` is the drop of the log-likelihood at the ends.
     """
     drop = profile - profile.min()
-    first_index, last_index = np.flatnonzero(drop <= PROFILE_DROP)[[0, -1]]
+    first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
 
     def interpolate_end(inside_index: int, outside: int) -> float | None:
         if not 0 <= outside < len(grid):
             return None
-        fraction = (PROFILE_DROP - drop[inside_index]) / (drop[outside] - drop[inside_index])
+        fraction = (max_drop - drop[inside_index]) / (drop[outside] - drop[inside_index])
         return float(grid[inside_index] + fraction * (grid[outside] - grid[inside_index]))
 
     return interpolate_end(first_index, first_index - 1), interpolate_end(

@@ -22,7 +22,7 @@ Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constan
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -40,6 +40,8 @@ MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise (σ) that each interval adds, relative to the measurement noise and to Q: it
 # makes a singular Q invertible
 MIN_NOISE_RATIO = 1e-5
+# Number of signals per computation: more need more memory and are not faster
+SIGNAL_BATCH_SIZE = 8
 # Smaller determinants of Q, relative to the product of its diagonal, are rounding errors
 MIN_DETERMINANT_RATIO = 1e-12
 
@@ -202,11 +204,18 @@ class FittedPositions:
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
 
-def fit_positions(positions: Positions, sigma_a_m_s2: float, variance_m2: Array) -> FittedPositions:
-    """Fit positions with one SIGMA_A and the variance of each measurement, shape (m,)."""
-    measurement_count, axes_count = positions.measurement_m.shape
-    measured_m = np.zeros((axes_count, 1, 1 + len(positions.constant_sigma), measurement_count))
-    measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
+def fit_positions(
+    positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
+) -> FittedPositions:
+    """Fit positions with one SIGMA_A; ``variance_m2``, shape (m,), are the measurement variances.
+
+    ``measured_m``, shape (a, 1 or T, 1 + c, m), replaces the measured positions by other data,
+    followed by their sensitivity to each constant.
+    """
+    if measured_m is None:
+        measurement_count, axes = positions.measurement_m.shape
+        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), measurement_count))
+        measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
@@ -288,6 +297,60 @@ def expected_squares(
         position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
         square_m2 += np.nansum(error_m**2 + position_variance, axis=0)
     return square_m2, np.isfinite(positions.measurement_m).sum(axis=1)
+
+
+def products_by_segment(
+    positions: Positions,
+    sigma_a_m_s2: float,
+    variance_m2: Array,
+    signals: Sequence[Array],
+    measured_m: Array,
+) -> Array:
+    """Return the inner product of each of k signals with a second signal, shape (s, k).
+
+    Parameters
+    ----------
+    positions : Positions
+        Positions with one time offset.
+    sigma_a_m_s2 : float
+    variance_m2 : ndarray, shape (m,)
+        Variance of each measurement.
+    signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
+        Measurements, Δp and Δv of the first signals.
+    measured_m : ndarray, shape (a, k, m)
+        Measurements of the second signals, which have no Δp and Δv.
+    """
+    first_measured_m, *increments = signals
+    constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
+    results = []
+    for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
+        batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
+        # order: first signals, second signals, sensitivities to the constants
+        dp, dv = (
+            np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
+                :, None
+            ]
+            for increment, constant_signal in zip(increments, constants, strict=True)
+        )
+        measured = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
+        first_rows, second_rows, constant_rows = np.split(
+            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
+        )
+        measured[:, 0, first_rows] = first_measured_m[batch]
+        measured[:, 0, second_rows] = measured_m[batch]
+        all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
+        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
+        information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
+            positions.constant_sigma**-2.0
+        )
+        constant_coefficients = np.linalg.solve(
+            information, gram[:, constant_rows[:, None], second_rows]
+        )
+        by_constants = np.einsum(
+            "skc,sck->sk", gram[:, first_rows[:, None], constant_rows], constant_coefficients
+        )
+        results.append(gram[:, first_rows, second_rows] - by_constants)
+    return np.concatenate(results, axis=1)
 
 
 @dataclass(frozen=True)

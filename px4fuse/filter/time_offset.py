@@ -2,8 +2,11 @@
 
 KF follows late positions, so a time offset τ hardly increases the innovations. Only the comparison
 of positions with the acceleration shows it. The likelihood of the positions given the acceleration
-is maximised over the noises, then over τ. Constant errors with a similar effect (biases, tilt,
-scale; :mod:`px4fuse.filter.imu_motion`) are estimated too.
+is maximised over τ and over the noises. Constant errors with a similar effect (biases, tilt, scale;
+:mod:`px4fuse.filter.imu_motion`) are estimated too.
+
+The noise of the IMU increases the variance of τ above the value from the curvature of the
+likelihood. The factor is simulated and widens the interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -25,7 +28,8 @@ from px4fuse.filter.imu_motion import (
     SignalCache,
     prepare_motion,
 )
-from px4fuse.filter.likelihood import parabola_vertex, profile_interval
+from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
+from px4fuse.filter.marginal_likelihood import products_by_segment
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -49,6 +53,8 @@ MIN_CHANGE_S = 0.10
 MIN_OFFSET_SIGMAS = 3.0
 # Minimum time offset (s) to be significant: a position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
+# Number of simulations of the IMU noise for the variance of the time offset
+SIMULATION_COUNT = 96
 
 
 class PartOffset(Record, frozen=True):
@@ -177,6 +183,7 @@ def estimate_time_offset(
         fit = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
         offset_s, sigma_s = _minimum_and_sigma(curve_s, fit.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
+    variance_factor = _simulate_variance_factor(prepared_motion, offset_s, noises, sigma_s**-2.0)
     while True:
         nodes_s, curve_s = (
             _offset_grid(offset_s, half_width_s, count) for count in (FINE_OFFSETS, CURVE_OFFSETS)
@@ -184,7 +191,7 @@ def estimate_time_offset(
         batches = prepared_motion.position_batches(nodes_s)
         totals = fit_noises(batches, noises, prepared_motion.weight).scores()[0]
         scores = CubicSpline(nodes_s, totals)(curve_s)
-        low_s, high_s = profile_interval(curve_s, scores)
+        low_s, high_s = profile_interval(curve_s, scores, PROFILE_DROP * variance_factor)
         is_closed = low_s is not None and high_s is not None
         if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
             break
@@ -206,14 +213,14 @@ def estimate_time_offset(
     change_p_value = None
     if not reason:
         progress("changes of the time offset in flight")
-        parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises)
+        parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_s = settings.clock_offset_s
     return ClockOffset(
         offset_s=applied_s + offset_s,
         interval_s=(applied_s + low_s, applied_s + high_s),
         applied_s=applied_s,
-        sigma_s=float(np.hypot(sigma_s, resolution_s)),
+        sigma_s=float(np.hypot(sigma_s * np.sqrt(variance_factor), resolution_s)),
         is_determinable=not reason,
         reason=reason,
         curve_s=applied_s + curve_s,
@@ -233,6 +240,51 @@ def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), count)
 
 
+def _simulate_variance_factor(
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
+) -> float:
+    """Return the simulated variance of the time offset ÷ its variance from the curvature.
+
+    The derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
+    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn is random even at rest,
+    because e contains the same noise n.
+    """
+    positions = prepared_motion.at(offset_s)
+    is_joined = positions.is_joined
+    count = len(prepared_motion.time_s)
+    axes = len(prepared_motion.directions)
+    interval_count = int(np.count_nonzero(is_joined))
+    rng = np.random.default_rng(count)
+
+    def draw_normal(size: int) -> Array:
+        return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
+
+    q00, q01, q11 = noises.sigma_a_m_s2**2 * positions.noise_unit[:, is_joined]
+    dp, dv = np.zeros((2, axes, SIMULATION_COUNT, count - 1))
+    dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
+    dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
+    dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
+    error_m = noises.sigma_z_m * draw_normal(count)
+    # the velocity noise is the sum of the increments since the start of the segment
+    velocity_noise = np.zeros_like(error_m)
+    for begin, end in positions.segments:
+        np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
+    # the random walk of the source is added after the velocity noise, which contains IMU noise only
+    if noises.random_walk_m:
+        dp[..., is_joined] += (
+            noises.random_walk_m
+            * np.sqrt(positions.length_s[is_joined])
+            * draw_normal(interval_count)
+        )
+    positions, variance = positions.in_sigma_z_units(
+        1.0, noises.random_walk_m, prepared_motion.weight / noises.sigma_z_m**2
+    )
+    products = products_by_segment(
+        positions, noises.sigma_a_m_s2, variance, (error_m, dp, dv), velocity_noise
+    )
+    return 1.0 + float(np.var(products.sum(axis=0))) / information
+
+
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
     """Return the minimum of a profile, found by a parabola, and σ from the curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
@@ -244,7 +296,7 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 
 
 def _offset_per_part(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Estimate the time offset of each segment, and the p-value of a constant offset."""
     coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
@@ -260,13 +312,14 @@ def _offset_per_part(
         prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
     ):
         part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
+        sigma_s *= float(np.sqrt(variance_factor))
         if sigma_s < MAX_PART_SIGMA_S:
             start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
             score_drops.append(profile - profile.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    ratio = 2.0 * float(np.sum(score_drops, axis=0).min())
+    ratio = 2.0 * float(np.sum(score_drops, axis=0).min()) / variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, ratio))
 
 

@@ -19,9 +19,8 @@ from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P, MIN_OFFSET_S, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.source_clock import MIN_OFFSET_S
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 
