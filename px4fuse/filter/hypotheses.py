@@ -427,7 +427,9 @@ class DesignFit:
 
     def estimate(self, column: int) -> Estimate:
         """Return one coefficient; its σ includes a ``residual_rms`` above 1."""
-        coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
+        coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
+            self.residual_rms, 1.0
+        )
         return Estimate(float(self.coefficients[column]), coefficient_sigma)
 
 

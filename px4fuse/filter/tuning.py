@@ -200,7 +200,7 @@ def tune_axes(
     axes: tuple[Axis, ...],
     settings: Settings,
     flight: Flight | None = None,
-    drifts: bool = False,
+    may_drift: bool = False,
     signal_cache: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
@@ -230,7 +230,7 @@ def tune_axes(
         )
         if not isinstance(prepared_motion, Unavailable):
             start_noises = replace(
-                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if drifts else 0.0
+                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
             # a coarse time offset is enough: a finer value hardly changes the noises
             offset_s, start_noises = prepared_motion.search_offset(
