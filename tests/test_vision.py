@@ -187,7 +187,8 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
         heights=None, state=whole.state[:15], variance=whole.variance[:15],
         clipped_fraction=None, is_acceleration_bad=None,
-        state_correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
+        state_correlation=np.eye(15), attitude_variance_rad2=unknown,
+        down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
     known = {**inputs.settings, **SETTINGS, **settings}

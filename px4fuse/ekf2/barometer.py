@@ -30,9 +30,9 @@ MATCH_TOLERANCE = 0.3
 # Maximum number of barometer samples that are reconstructed between two logged rows
 MAX_SAMPLES_PER_ROW = 30
 # Maximum weight of a barometer sample that stands for missing neighbours
-MAX_WEIGHT = 4.0
+MAX_SAMPLE_WEIGHT = 4.0
 # Minimum sum of weights of missing barometer samples, to avoid a division by zero
-MIN_WEIGHT = 1e-9
+MIN_WEIGHT_SUM = 1e-9
 
 
 def sample_interval_s(fusion_record: FusionRecord) -> float:
@@ -73,7 +73,7 @@ def fused_samples(
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
     # each sample stands for half of the missing samples before and half of those after it
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
-    return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_WEIGHT)})
+    return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_SAMPLE_WEIGHT)})
 
 
 def _known_and_simulated_samples(
@@ -194,5 +194,5 @@ def _with_missing_innovations(
         axis=1
     )
     offset_m = filtered_m[1:] - remaining_fraction * filtered_m[:-1] - known_m
-    offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT)
+    offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT_SUM)
     return np.where(is_missing, scatter_m + offset_m[:, None], innovation_m)

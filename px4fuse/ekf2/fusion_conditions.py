@@ -23,7 +23,7 @@ EV_START_INTERVAL_S = 0.2
 # (ev_pos_control.cpp)
 EV_STOP_INTERVAL_S = 0.4
 # EKF2 stops GNSS fusion, and before v1.14 vision fusion, after this time (s): reset_timeout_max
-STOP_S = 7.0
+FUSION_STOP_S = 7.0
 # Maximum delay (s) of EKF2's fusion horizon, from the delay parameters
 MAX_HORIZON_S = 1.0
 # Number of position samples in EKF2's buffer
@@ -31,9 +31,9 @@ BUFFER_COUNT = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
 TIME_STEP_S = 5e-7
 # Time (s) with all samples rejected after which EKF2 stops fusion: no_aid_timeout_max
-GATE_TIME_S = 1.0
+MAX_REJECTED_S = 1.0
 # Maximum range (m) of constant positions, which are no measurement
-MAX_CONSTANT_M = 1e-3
+MAX_CONSTANT_RANGE_M = 1e-3
 # Minimum fraction of the time with a failed GNSS check that explains missing GNSS fusion
 MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP = (
@@ -160,7 +160,7 @@ def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
 
 def is_height_only(source: PositionTrack) -> bool:
     """Return True if x and y of a source are constant: only its height is measured."""
-    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
+    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
 
 
 def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
@@ -177,7 +177,7 @@ def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
 
 def _check_gap(attempt: Attempt) -> Iterator[UnmetCondition]:
     is_short = attempt.is_vision and attempt.has_switch
-    limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
+    limit_s = EV_STOP_INTERVAL_S if is_short else FUSION_STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
     # EKF2 stops fusion when no position has arrived for limit_s
@@ -343,7 +343,7 @@ def _check_gate(attempt: Attempt) -> Iterator[UnmetCondition]:
     aid_log = attempt.ekf2.aids.get(aid.name)
     if aid_log is None or "rejected" not in aid_log.samples:
         return
-    rejected_fraction = attempt.samples_in_span(aid_log.samples, GATE_TIME_S)["rejected"].mean()
+    rejected_fraction = attempt.samples_in_span(aid_log.samples, MAX_REJECTED_S)["rejected"].mean()
     if rejected_fraction > 0.5:
         yield UnmetCondition(
             "gate",

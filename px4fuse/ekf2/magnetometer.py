@@ -19,9 +19,9 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_SIGMA_GAUSS = 0.01
-EYE = np.eye(3)
-# Matrix with which v @ CROSS is the cross product matrix [v]× of a vector v
-CROSS = skew(EYE).reshape(3, 9)
+IDENTITY = np.eye(3)
+# Matrix with which v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v
+CROSS_PRODUCT = skew(IDENTITY).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -107,14 +107,14 @@ def fuse_mean(
     measured_state = x[:, rows]
     sample_count = sample_mean.sample_count
     cross_state, cross_theta = (
-        (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
+        (vectors @ CROSS_PRODUCT).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, rows] = sample_mean.rotation_to_body @ (EYE - cross_theta)
+    H[:, :, rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
     predicted_value = (H[:, :, rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_rows is not None:
-        H[:, :, bias_rows] = EYE
+        H[:, :, bias_rows] = IDENTITY
         predicted_value += x[:, bias_rows]
     nu = sample_mean.value - predicted_value
     HP = H @ P

@@ -593,7 +593,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise:g} m)"
         )
     if replay.late or replay.lost:
-        remedy_text = (
+        remedy = (
             "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
         )
         # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
@@ -601,7 +601,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         received_count = max(len(replay.updates), replay.late) + replay.lost
         yield (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {received_count} samples "
-            f"would arrive after the fusion horizon ({replay.lost} would never be fused){remedy_text}"
+            f"would arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
         )
 
 
