@@ -205,7 +205,7 @@ def test_ekf2_replay_start_covariance_uses_data_before_start():
     assert segment.history is not None
     assert segment.history.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
     assert segment.history.time_s[0] < 1.0
-    of_tilt = segment.correlation[:2, 12:15] @ segment.body_to_ned[0].T
+    of_tilt = segment.state_correlation[:2, 12:15] @ segment.body_to_ned[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 

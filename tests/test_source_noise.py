@@ -128,7 +128,7 @@ def test_correlated_noise_is_distinguished_from_low_pass() -> None:
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.time_correlated_noise
         assert found.gain_nats > 30.0
-        assert (found.lag_nats > 1.0) == lags
+        assert (found.low_pass_gain_nats > 1.0) == lags
         assert found.slow_m >= found.white_m
 
 

@@ -193,7 +193,7 @@ def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    fit = estimates.bias_scale_jump_fit
+    fit = estimates.systematic_errors
     if isinstance(fit, Unavailable) or not fit.has_bias:
         return []
     biases = {FORWARD_BIAS: fit.forward_bias, RIGHT_BIAS: fit.right_bias}

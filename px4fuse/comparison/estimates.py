@@ -22,7 +22,7 @@ from px4fuse.filter.correlated_noise import (
 )
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
-from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
+from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, SystematicErrors, fit_systematic_errors
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
@@ -75,7 +75,7 @@ class Estimates:
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
-    bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
+    systematic_errors: SystematicErrors | Unavailable
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     tuning_by_axis: tuple[AxisTuning, ...] = ()
@@ -107,7 +107,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         tuning=tuning,
         clock=clock,
         heading=estimate_frame_rotation(comparison, tuning, clock, progress),
-        bias_scale_jump_fit=fit,
+        systematic_errors=fit,
         source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
         tuning_by_axis=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
@@ -204,7 +204,7 @@ def estimate_frame_rotation(
 def _fit_source_errors(
     comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable
 ) -> tuple[
-    BiasScaleJumpFit | Unavailable,
+    SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
@@ -216,7 +216,7 @@ def _fit_source_errors(
     offset_s = 0.0
     if isinstance(clock, ClockOffset) and clock.is_determinable:
         offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
-    fit = fit_bias_scale_jumps(
+    fit = fit_systematic_errors(
         flight,
         axes,
         settings,
@@ -226,7 +226,7 @@ def _fit_source_errors(
         clock_offset_s=offset_s,
         announced_s=reset_times_s(comparison.source).tolist(),
     )
-    jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
+    jumps = fit.jumps if isinstance(fit, SystematicErrors) else ()
     # the exact time of a jump is unknown: exclude measurements just after the jump
     time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:

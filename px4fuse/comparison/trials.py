@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
-from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
+from px4fuse.filter.consistency import Reference, classify_sigma_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
@@ -217,7 +217,8 @@ def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
 def becomes_consistent(trial: Trial) -> bool:
     """Return True if a re-run makes a σ ratio consistent."""
     return any(
-        classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
+        classify_sigma_ratio(before, name) != "consistent"
+        and classify_sigma_ratio(after, name) == "consistent"
         for name, before, after in ratio_pairs(trial)
     )
 
@@ -225,7 +226,7 @@ def becomes_consistent(trial: Trial) -> bool:
 def halves_discrepancy(trial: Trial) -> bool:
     """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
     return any(
-        classify_ratio(before, name) != "consistent"
+        classify_sigma_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
         for name, before, after in ratio_pairs(trial)
     )
@@ -235,7 +236,9 @@ def remains_overconfident(trial: Trial) -> bool:
     """Return True if the filter remains nearly as overconfident against ground truth as before."""
     return any(
         name == "truth"
-        and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
+        and classify_sigma_ratio(before, name)
+        == classify_sigma_ratio(after, name)
+        == "overconfident"
         and math.log(after) > MAX_ERROR_LEFT * math.log(before)
         for name, before, after in ratio_pairs(trial)
     )
@@ -279,7 +282,7 @@ def can_improve(trial: Trial) -> bool:
     This requires ground truth or a σ ratio that is inconsistent as flown.
     """
     return trial.before.position_rmse_m is not None or any(
-        classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
+        classify_sigma_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
     )
 
 
@@ -294,7 +297,8 @@ def improvement(trial: Trial) -> Improvement:
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
     is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
-        abs(math.log(after)) <= abs(math.log(before)) or classify_ratio(after, name) == "consistent"
+        abs(math.log(after)) <= abs(math.log(before))
+        or classify_sigma_ratio(after, name) == "consistent"
         for name, before, after in ratio_pairs(trial)
     )
     if is_position_better:

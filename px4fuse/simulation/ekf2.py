@@ -236,7 +236,7 @@ def _make_segment(
             ),
             down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
-            correlation=covariance / sigma[:, None] / sigma,
+            state_correlation=covariance / sigma[:, None] / sigma,
             fusing=False,
         ),
         step_us,

@@ -19,7 +19,7 @@ from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import MAX_CHANGE_P, MIN_OFFSET_S, ClockOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, MIN_OFFSET_S, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse_mistakes
@@ -51,7 +51,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
         clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.is_determinable,
         clock.is_determinable and false,
-        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P,
+        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P_VALUE,
     )  # fmt: skip
 
 
