@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.form_points import (
     POINTS_TABLE,
     accepted_corrections,
     form_points,
-    panels,
+    panels_showing,
 )
 from px4fuse.cli.simulate import simulate
 from px4fuse.results.answer_form import (
@@ -96,7 +96,7 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
         offered = accepted_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
-        assert set(panels(name)) > {"cover"}
+        assert set(panels_showing(name)) > {"cover"}
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:

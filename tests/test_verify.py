@@ -498,7 +498,7 @@ def test_verify_report_with_changed_pdf_document_states_reason(
     # the class table prints the first reason
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
-        assert verdict.remedy.startswith("Ask for the PDF")
+        assert verdict.remedy.startswith("Ask the author of the report")
         assert LIMIT_NOTE not in verdict.reasons
 
 

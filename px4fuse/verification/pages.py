@@ -161,11 +161,11 @@ class _PdfComparison:
     is_same_text: TextComparison
     # object number and generation in the submitted PDF, and object number in the redrawn PDF
     compared_pairs: set[tuple[int, int, int]] = field(default_factory=set)
-    # parents of pages, which are compared after the document catalogue
+    # parents of pages in both PDFs, to be compared after the document catalogue
     parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page, by their names in the page content
     fonts: Mapping[str, Any] = field(default_factory=dict)
-    # number of compared values, which is limited because a malicious PDF may contain very many
+    # number of compared values: a malicious PDF may contain millions
     value_count: int = 0
 
     def differences(

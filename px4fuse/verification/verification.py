@@ -78,7 +78,7 @@ MAX_ITERATION_DIFFERENCE = 2
 # Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
-MAX_LISTED_PAGES = 5
+MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
 # Factors between a result and its printed number: 1, per cent, thousandths (mm, ms)
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
@@ -311,10 +311,12 @@ def _verify_with_log(
     status: Status = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
-    page_sentences = [difference.sentence for difference in page_differences[:MAX_LISTED_PAGES]]
-    if len(page_differences) > MAX_LISTED_PAGES:
+    page_sentences = [
+        difference.sentence for difference in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]
+    ]
+    if len(page_differences) > MAX_LISTED_PAGE_DIFFERENCES:
         page_sentences.append(
-            f"the PDF has {len(page_differences) - MAX_LISTED_PAGES} more differences"
+            f"the PDF has {len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES} more differences"
         )
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":

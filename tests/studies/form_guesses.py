@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
-from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels
+from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
 from px4fuse.results.answer_form import (
     CORRECTIONS,
     EKF2_BEHAVIOURS,
@@ -103,7 +103,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
         for from_s in (None, float(np.median(begins))):
             claim = StudentMistake(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
-                parameter=cure, panel=panels(kind)[0],
+                parameter=cure, panel=panels_showing(kind)[0],
             )  # fmt: skip
             yield replace(blank, mistakes=(claim,))
 
@@ -120,7 +120,7 @@ def right(one: FormTruth) -> Answers:
             StudentMistake(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
-                panel=panels(wrong.kind)[0],
+                panel=panels_showing(wrong.kind)[0],
             )
         )  # fmt: skip
     return Answers(

@@ -268,7 +268,7 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         if not numbers:
             label = self.name or f"the number {self.path}"
             reason_text = check_input.missing_reason(self.path)
-            return 0.0, f"Your report has no number for {label}{reason_text}."
+            return 0.0, f"Your report does not contain {label}{reason_text}."
         fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))

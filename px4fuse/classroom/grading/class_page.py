@@ -26,7 +26,7 @@ from px4fuse.html.safe import load_template, local_link
 from px4fuse.results.answer_form import form_rows
 
 HISTOGRAM_BIN_COUNT = 10
-MISSING_REPORT = "no submission"
+NO_SUBMISSION_STATUS = "no submission"
 # CSS style and symbol of each verification status, in the order in which the class table sorts them
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
@@ -34,7 +34,7 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     "other log": ("odd", "⇄"),
     "cannot verify": ("open", "?"),
     "page differs": ("odd", "≠"),
-    MISSING_REPORT: ("open", "–"),
+    NO_SUBMISSION_STATUS: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
 FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
@@ -101,7 +101,7 @@ def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str
 
 def _entry_tags(entry: Entry) -> list[str]:
     report = entry.counted_report
-    tags = [report.status if report else MISSING_REPORT]
+    tags = [report.status if report else NO_SUBMISSION_STATUS]
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
@@ -113,7 +113,7 @@ def _entry_tags(entry: Entry) -> list[str]:
 
 def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
     report = entry.counted_report
-    status = report.status if report else MISSING_REPORT
+    status = report.status if report else NO_SUBMISSION_STATUS
     css_style, symbol = STATUS_STYLES[status]
     flag_count = len(entry.flags)
     flag_count_text = f"{flag_count} flag{'s' if flag_count > 1 else ''}" if flag_count else ""

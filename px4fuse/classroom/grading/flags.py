@@ -71,7 +71,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
-    if results.log.hardware == flights.HARDWARE and not has_key:
+    if results.log.hardware == flights.SIMULATION_HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
 
 

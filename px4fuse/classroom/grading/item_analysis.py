@@ -11,7 +11,7 @@ from px4fuse.classroom.grading.model import GradedReport
 
 # Minimum number of reports for a correlation of points
 MIN_REPORTS = 5
-TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
+ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class ItemStatistics:
     discrimination: float | None
 
     @property
-    def row(self) -> tuple[str, ...]:
-        """Cells of the row of ``items.csv``, in the order of TITLES."""
+    def csv_row(self) -> tuple[str, ...]:
+        """Cells of the row of ``items.csv``, in the order of ITEM_STATISTICS_TITLES."""
         numbers = (
             len(self.fractions),
             round(float(np.mean(self.fractions)), 3),

@@ -57,7 +57,7 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
         yield (
             f"You named {mistake.kind} ({description}). Show it in your report, and name a panel "
             "that cannot show it, with the reason.",
-            f"{describe_right_answer(mistake)}. Cannot show it, for example: "
+            f"{describe_right_answer(mistake)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )
     given_ranges = dict(enumerate(form.predictions))

@@ -38,7 +38,7 @@ from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_
 from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import class_page_html
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
-from px4fuse.classroom.grading.item_analysis import TITLES, analyse_items
+from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
 from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
 from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
@@ -53,9 +53,9 @@ from px4fuse.html.safe import load_template
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
-NAMES_FILE = "names.csv"
+PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
-NAMES_TITLES = ("pseudonym", "id", "name")
+PSEUDONYM_TITLES = ("pseudonym", "id", "name")
 # Columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
     "file",
@@ -123,16 +123,16 @@ def write_class(
     feedback_texts = [feedback_text(entry, class_title) for entry in entries]
     reports = [report for entry in entries if (report := entry.counted_report)]
     item_rows = tuple(
-        tuple(map(neutralise_formulas, item_statistics.row))
+        tuple(map(neutralise_formulas, item_statistics.csv_row))
         for item_statistics in analyse_items(reports)
     )
     contents = {
         "class.csv": class_table_csv(entries).encode(),
-        "items.csv": ("\ufeff" + Sheet(Path(), TITLES, item_rows).text).encode(),
+        "items.csv": ("\ufeff" + Sheet(Path(), ITEM_STATISTICS_TITLES, item_rows).text).encode(),
     }
     if course.anonymous:
-        page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
-        contents[NAMES_FILE] = names_table.encode()
+        page_entries, names_table = _anonymise_entries(page_entries, output / PSEUDONYMS_FILE)
+        contents[PSEUDONYMS_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = class_page_html(page_entries, class_title, made_with).encode()
     if course.question_count and course.key is not None:
@@ -196,7 +196,7 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
             sheet = read_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, student = (
-                sheet.cell(row, (title,)).removeprefix("'") for title in NAMES_TITLES
+                sheet.cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
             )
             names_by_identity[identity] = pseudonym, student
     used_pseudonyms = {pseudonym for pseudonym, _ in names_by_identity.values()}
@@ -216,7 +216,7 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
     anonymous_entries = [
         anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
     ]
-    names_table = "\ufeff" + Sheet(path, NAMES_TITLES, tuple(rows)).text
+    names_table = "\ufeff" + Sheet(path, PSEUDONYM_TITLES, tuple(rows)).text
     return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
 
 

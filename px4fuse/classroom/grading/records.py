@@ -27,7 +27,7 @@ from px4fuse.verification.verification import log_sha256, recompute, verify
 RECORDS_FOLDER = "records"
 # Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
-# Suffix of a report with px4fuse's diagnosis, which the report of an assignment withholds
+# Suffix of a report with px4fuse's diagnosis, which is the feedback on an assignment
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 

@@ -36,7 +36,7 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import cannot_verify, log_sha256
 
-DEFAULT_NAME = "rubric.toml"
+DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
@@ -93,7 +93,9 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def rubric_text() -> str:
-    return files("px4fuse.classroom.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
+    return (
+        files("px4fuse.classroom.grading").joinpath(DEFAULT_RUBRIC_NAME).read_text(encoding="utf-8")
+    )
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -105,7 +107,7 @@ def read_rubric(path: Path | None) -> Rubric:
         The file cannot be read or is not a rubric; the message names the item and the field.
     """
     if path is None:
-        return parse_rubric(rubric_text(), DEFAULT_NAME)
+        return parse_rubric(rubric_text(), DEFAULT_RUBRIC_NAME)
     return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
 
 
