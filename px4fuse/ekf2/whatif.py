@@ -593,9 +593,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise:g} m)"
         )
     if replay.late or replay.lost:
-        remedy = (
-            "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
-        )
+        remedy = "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
         # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
         # prediction step
         received_count = max(len(replay.updates), replay.late) + replay.lost
