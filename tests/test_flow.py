@@ -18,7 +18,7 @@ from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 # interval (s) and weight of a new sample in EKF2's low-pass filter, ekf.h
@@ -35,7 +35,7 @@ def low_pass_weights(raw: np.ndarray) -> np.ndarray:
 
 @cache
 def model() -> Model:
-    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse(())))
+    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_mistakes(())))
 
 
 def true_velocity(times: np.ndarray) -> np.ndarray:

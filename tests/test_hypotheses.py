@@ -26,7 +26,7 @@ from px4fuse.findings import source_positions as sent
 from px4fuse.findings import source_stamps as stamps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
@@ -53,7 +53,7 @@ def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analy
 @cache
 def flight(*mistakes: str, passes: int = 4) -> Flight:
     size = Scenario(ekf2=False, truth=False, seed=3, passes=passes)
-    return simulate_flight(size, parse(mistakes))
+    return simulate_flight(size, parse_mistakes(mistakes))
 
 
 @cache
@@ -238,7 +238,9 @@ def test_time_offset_is_not_reported_as_low_pass() -> None:
 
 @cache
 def with_ekf2(*mistakes: str) -> Analysis:
-    return unexplained(compare(simulate_flight(Scenario(seed=3), parse(mistakes)), axes=("north",)))
+    return unexplained(
+        compare(simulate_flight(Scenario(seed=3), parse_mistakes(mistakes)), axes=("north",))
+    )
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])

@@ -79,8 +79,8 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
     # a time offset beyond the range of the settings is found at the edge of the searched range
-    low_s, high_s, _ = SETTING_RANGES["clock_offset_s"]
-    clock_offset_s = min(max(settings.clock_offset_s - late_s, low_s), high_s)
+    limits_s = SETTING_RANGES["clock_offset_s"][:2]
+    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
     flight, source_track = correct_convention(flight, source_track, convention)
     source_track = _move_to_vehicle(source_track, flight)
