@@ -301,7 +301,7 @@ def test_time_offset_of_flight_parts_maximises_likelihood(monkeypatch, offset_s)
         position_batches=lambda grid: grid,
         weight=None,
     )
-    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1))
+    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), 1.0)
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])

@@ -97,7 +97,8 @@ def deciding(
         rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        rejected=np.array([logged]), reset=np.array([logged_reset]), has_all_resets=False,
+        logged_rejected=np.array([logged]), logged_reset=np.array([logged_reset]),
+        has_all_resets=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])

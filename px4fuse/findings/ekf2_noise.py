@@ -4,7 +4,7 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
-from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
+from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
 from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -65,7 +65,7 @@ def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(before, against) != "consistent"
         and classify_sigma_ratio(after, against) == "consistent"
-        for against, before, after in ratio_pairs(trial)
+        for against, before, after in sigma_ratio_changes(trial)
         if against == "source"
     )
     return trial if is_confirmed else None
