@@ -55,7 +55,7 @@ def test_item_analysis_lists_form_parts_and_faults() -> None:
     *_, sizes, fault = analyse_items(reports)
     assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
     assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
-    assert fault.row[1:3] == ("5", "0.6")
+    assert fault.csv_row[1:3] == ("5", "0.6")
 
 
 def test_item_analysis_excludes_reports_with_open_decision() -> None:
