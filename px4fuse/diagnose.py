@@ -48,7 +48,7 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
@@ -93,12 +93,12 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     """
     if comparison.flight.log.is_assessed:
         withheld_parts: dict[str, Any] = {
-            field.name: WITHHELD for field in fields(Analysis) if field.default is MISSING
+            field.name: DIAGNOSIS_WITHHELD for field in fields(Analysis) if field.default is MISSING
         }
         known_parts = {
             **vars(comparison),
-            "tuning": {HORIZONTAL: WITHHELD},
-            "difference_steps": dict.fromkeys(comparison.axes, WITHHELD),
+            "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
+            "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
             "trials": (),
             "events": collect_events(comparison),
         }
@@ -280,7 +280,9 @@ def run_what_if(
     flight = flight or read_flight(recordings, progress)
     is_default_change = not changes and sweep is None and not request.without
     if flight.log.is_assessed and is_default_change:
-        raise MissingDataError(f"{flight.log.name}: {WITHHELD.reason}", "Give --set or --sweep.")
+        raise MissingDataError(
+            f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
+        )
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):

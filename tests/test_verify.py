@@ -70,7 +70,7 @@ LOOP_LOG = SAMPLES / "loop_vio.ulg"
 def _compare_pages_in_process() -> Iterator[None]:
     """Compare pages in this process; test_pages.py tests the separate one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
+        patch.setattr(pages, "run_one_with_limits", lambda function, job, *_: function(job))
         yield
 
 

@@ -31,7 +31,7 @@ from px4fuse.batch.rows import (
 )
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import max_log_bytes
-from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_bounded
+from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
 from px4fuse.core.writing import write_all
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import requested_settings
@@ -204,7 +204,7 @@ def run(
         for log in logs
     ]
     run_in_processes = partial(
-        run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
+        run_with_limits, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
     )
     with (
         connect_cluster(scheduler) as client,

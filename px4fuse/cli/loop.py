@@ -162,13 +162,13 @@ def loop(
     (g2o), which is optimised. LOG:vio, LOG:ekf2 or LOG:kf selects the track of a log; the default
     is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.core.reading import split_part
+    from px4fuse.core.reading import split_path_and_part
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    log = split_part(str(source))[0]  # without the name of the track
+    log = split_path_and_part(str(source))[0]  # without the name of the track
     student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
@@ -226,13 +226,13 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.core.reading import split_part
+    from px4fuse.core.reading import split_path_and_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
-    path, track = split_part(str(source))
+    path, track = split_path_and_part(str(source))
     if track is not None:
         raise SettingsError(
             f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."

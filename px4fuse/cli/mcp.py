@@ -17,7 +17,12 @@ from typing import Any, get_args
 import click
 
 from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
-from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
+from px4fuse.core.reading import (
+    check_readable,
+    max_log_bytes,
+    readable_folders,
+    split_path_and_part,
+)
 from px4fuse.errors import SettingsError
 
 # Name of the argument of a tool, by the name of the command's parameter if the names differ
@@ -217,7 +222,7 @@ def _parse(
         texts = [str(text) for text in (value if isinstance(value, list) else [value])]
         if isinstance(parameter.type, options.InputPath):
             texts = [_find_file(texts[0], folders)]
-            files.append(split_part(texts[0])[0])
+            files.append(split_path_and_part(texts[0])[0])
         if isinstance(parameter, click.Argument):
             operands += texts
         elif isinstance(value, bool):
@@ -236,6 +241,6 @@ def _find_file(text: str, folders: Sequence[Path]) -> str:
         The file is outside the folders.
     """
     paths = [str(folder / text) for folder in folders]
-    path = next((path for path in paths if split_part(path)[0].exists()), paths[0])
-    check_readable(split_part(path)[0], folders)
+    path = next((path for path in paths if split_path_and_part(path)[0].exists()), paths[0])
+    check_readable(split_path_and_part(path)[0], folders)
     return path

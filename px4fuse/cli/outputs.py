@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.core.input_files import check_outputs
-from px4fuse.core.writing import STANDARD_OUTPUT, write_all, written_before
+from px4fuse.core.writing import STANDARD_OUTPUT, format_written_outputs, write_all
 from px4fuse.errors import OutputError, ResultsError, to_one_line
 
 if TYPE_CHECKING:
@@ -253,7 +253,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 def written_so_far(context: click.Context) -> str:
     written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
-    return f"{written_before(written_files)}." if written_files else "nothing was written."
+    return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:

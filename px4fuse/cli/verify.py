@@ -44,7 +44,7 @@ def verify(
 
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
-    from px4fuse.core.workers import JobFailure, run_one_bounded
+    from px4fuse.core.workers import JobFailure, run_one_with_limits
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
@@ -59,7 +59,7 @@ def verify(
         if logs and not files:
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
-        verdict = run_one_bounded(
+        verdict = run_one_with_limits(
             partial(verify_report, pdf=content, logs=files), recorded_results, TIMEOUT_S
         )
     if isinstance(verdict, JobFailure):

@@ -16,7 +16,7 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
-    HEIGHT_ONLY,
+    HEIGHT_ONLY_REASON,
     Columns,
     Ekf2,
     Flight,
@@ -33,12 +33,12 @@ from px4fuse.readers.px4_innovations import (
     fused_aid,
     with_gnss_innovations,
 )
-from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
-LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
+LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {source.name: source.origin for source in POSITION_INPUTS}
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -256,9 +256,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         name = flight.positions[0].name
         remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
     reason = f"{damage_text}no external position in this log (no {topics})"
-    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
+    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
     if height_only is not None:
-        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY}"
+        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"
@@ -277,7 +277,7 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].preference < track.origin.preference
+        and LOGGED_ORIGINS[missing.source].preference_rank < track.origin.preference_rank
     ]
     if not better_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"

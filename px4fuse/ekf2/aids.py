@@ -309,8 +309,8 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 def _longest_gap(
     times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    is_inside = (log.unknown_fusion_s > start_s) & (log.unknown_fusion_s < end_s)
-    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unknown_fusion_s[is_inside])
+    is_inside = (log.unknown_fusion_times_s > start_s) & (log.unknown_fusion_times_s < end_s)
+    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unknown_fusion_times_s[is_inside])
     starts = ends[:-1]
     is_enabled = np.ones(len(starts), bool)
     if log.enabled is not None:

@@ -48,7 +48,7 @@ def sample_interval_s(record: FusionRecord) -> float:
         low, median, high = np.percentile(intervals_s, [25.0, 50.0, 75.0])
         if high - low < MAX_INTERVAL_SCATTER * median:
             return float(median)
-    return 1.0 / (OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ)
+    return 1.0 / (OLD_BAROMETER_HZ if record.stores_bias_increments else BAROMETER_HZ)
 
 
 def _bias_gain(bias: pd.DataFrame) -> Array:

@@ -34,7 +34,7 @@ from px4fuse.flight.ekf2_parameters import (
     MAG,
     Aid,
     effective_settings,
-    fuses_by_mask,
+    uses_aid_mask,
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
@@ -239,7 +239,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if is_gnss else ()
-    if unmodelled_aids := [label for label in record.other_aiding if label not in modelled_aids]:
+    if unmodelled_aids := [
+        label for label in record.other_horizontal_aids if label not in modelled_aids
+    ]:
         disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
         return Unavailable(
             ANALYSIS_NAME,
@@ -350,7 +352,7 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    min_bias_variance = 5e-8 / step_s**2 if record.per_step_biases else None
+    min_bias_variance = 5e-8 / step_s**2 if record.stores_bias_increments else None
     is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
     if is_gnss:
         # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
@@ -371,7 +373,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
         )
     # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
-    if not fuses_by_mask(record.parameters):
+    if not uses_aid_mask(record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
     return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
 
@@ -426,7 +428,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
-    fuses_velocity = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
+    fuses_velocity = uses_aid_mask(parameters) or switch & GNSS_VELOCITY_BIT
     velocity_variance = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
     return ReceivedPositions(
@@ -438,7 +440,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
-        uses_sender_times=track.age_s == 0.0 != flown_s,
+        uses_sender_times=track.assumed_delay_s == 0.0 != flown_s,
     )
 
 
@@ -459,7 +461,7 @@ def read_vision(
     is_rotated_by_ekf2 = (
         not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
     )
-    if fuses_by_mask(record.parameters):
+    if uses_aid_mask(record.parameters):
         is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
@@ -504,7 +506,7 @@ def _read_vision_besides_gnss(
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
     if (enabled_log := _enabled_log(ekf2, EV_POS)) is None:
         return None
-    if fuses_by_mask(record.parameters):
+    if uses_aid_mask(record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
             f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "

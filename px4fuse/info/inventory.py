@@ -24,7 +24,7 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import WITHHELD, Stream
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD, Stream
 from px4fuse.flight.model import (
     Ekf2,
     Flight,
@@ -351,7 +351,7 @@ def _logging_advice(
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings on the recording and of missing data, each action once."""
     if flight.log.is_assessed:
-        return (LoggingAdvice("None", (WITHHELD.reason,)),)
+        return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:

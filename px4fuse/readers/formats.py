@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.core.reading import display_name
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError
 
-_FORMATS = table(__file__, "formats.toml", dict[str, list[dict[str, Any]]])
+_FORMATS = read_toml(__file__, "formats.toml", dict[str, list[dict[str, Any]]])
 STREAMS = _FORMATS["streams"]
 
 

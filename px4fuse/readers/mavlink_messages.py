@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.flight.model import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
@@ -82,7 +82,7 @@ class FrameOfReference:
     body: bool = False
 
 
-_TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 if names := [name for name, layout in LAYOUTS.items() if layout.optional]:
     raise ValueError(f"mavlink_messages.toml: `optional` in {names}. Move its fields to `columns`.")

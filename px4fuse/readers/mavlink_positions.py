@@ -149,7 +149,7 @@ def _read_gnss(
         clock=f"{BOOT_CLOCK} minus {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
         log=recording.frames.name,
-        age_s=delay_s,
+        assumed_delay_s=delay_s,
     )
 
 

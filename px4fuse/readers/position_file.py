@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, IntArray, median_interval
-from px4fuse.core.reading import read_bytes_limited, split_part
+from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
@@ -139,7 +139,7 @@ def read_position_file(
         An option has an invalid value or names a column that is not in the file.
     """
     _check_options(columns, time_unit, length_unit)
-    path, part = split_part(str(path))
+    path, part = split_path_and_part(str(path))
     table, sha256, size_bytes = _open_table(path, columns, body or part)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]

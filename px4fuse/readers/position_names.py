@@ -5,14 +5,14 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Column indices of x, y and z; None without height
 Position = tuple[int, int, int | None]
-_TABLE = table(__file__, "position_names.toml", dict[str, dict[str, str]])
+_TABLE = read_toml(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
     {
         word: meaning

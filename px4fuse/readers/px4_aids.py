@@ -122,7 +122,7 @@ def _read_common_topics(
     for values, variances in layouts:
         innovations = topics.primary_samples(values)
         samples = topics.primary_samples(values, select=_drop_repeats)
-        unknown_fusion_s = _unknown_fusion_times(
+        unknown_fusion_times_s = _unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variances)[f"variance_{aid.axes[0]}"],
         )
@@ -136,7 +136,7 @@ def _read_common_topics(
         used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
         log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
         if log is not None:
-            return replace(log, unknown_fusion_s=unknown_fusion_s)
+            return replace(log, unknown_fusion_times_s=unknown_fusion_times_s)
     return None
 
 

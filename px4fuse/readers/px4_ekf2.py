@@ -339,8 +339,8 @@ def _read_record(
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
-        per_step_biases=attitude == px4.QUATERNION_FILTER,
-        other_aiding=tuple(
+        stores_bias_increments=attitude == px4.QUATERNION_FILTER,
+        other_horizontal_aids=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS
             if name in enabled_aids and enabled_aids[name].any()

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, TABLES
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETER_TABLES
 from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
 Innovations = dict[AxisName, TableOrUnavailable]
@@ -29,7 +29,9 @@ class Ekf2Source:
     height: str = ""
 
 
-VISION, GNSS = (msgspec.convert(TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss"))
+VISION, GNSS = (
+    msgspec.convert(PARAMETER_TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss")
+)
 GNSS_AND_BAROMETER = replace(
     GNSS,
     vertical=BAROMETER.name,

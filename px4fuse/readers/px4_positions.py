@@ -11,9 +11,9 @@ from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
-from px4fuse.flight.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
+from px4fuse.flight.log import REPEATED_TIMESTAMPS, SENDER_CLOCK, ClockMap
 from px4fuse.flight.model import (
-    HEIGHT_ONLY,
+    HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
     Columns,
     Ekf2,
@@ -88,7 +88,7 @@ def split_tracks(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate the position tracks, best first, from the reasons for missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference)
+    available_tracks.sort(key=lambda track: track.origin.preference_rank)
     return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
 
 
@@ -132,7 +132,7 @@ def make_track(
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
         if is_height_only:
-            fault = HEIGHT_ONLY
+            fault = HEIGHT_ONLY_REASON
         return unavailable(name, fault, remedy)
     if origin.kind == "uwb":
         origin = structs.replace(origin, kind=kind_without_orientation(samples))
@@ -223,7 +223,7 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
         note = "timestamp_sample does not contain boot times in microseconds"
     elif (distinct := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
         return ClockMap(
-            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, SHARED_STAMPS, distinct
+            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct
         )
     else:
         return None
@@ -466,7 +466,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         clock=clock,
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
-        age_s=delay_ms * 1e-3,
+        assumed_delay_s=delay_ms * 1e-3,
         **track_fields,
     )
     if isinstance(track, PositionTrack):

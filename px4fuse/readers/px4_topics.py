@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
@@ -38,7 +38,7 @@ class TrackSource:
         return find_origin(self.kind, self.path)
 
 
-_TABLE = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
@@ -67,7 +67,7 @@ RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
 # Tracks of external vision and motion capture that have a separate topic
 SOURCE_TRACKS = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
-TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
+ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACKS.items()}
 # Aiding sources whose flag "fused" is always set in v1.15 and v1.16, so it is not used
 FLAG_ALWAYS_SET = ("gravity", "drag")
 # Aiding sources with a local position as logged observation (GNSS has latitude and longitude)
