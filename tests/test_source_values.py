@@ -30,7 +30,7 @@ from px4fuse.findings.model import finding
 from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
 from px4fuse.flight.model import Columns, Flight
 from px4fuse.readers import read_log
-from px4fuse.readers.common import find_invalid, rounding_step
+from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -54,7 +54,7 @@ def track(count: int = 60) -> pd.DataFrame:
 
 def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
     """Return the row numbers of invalid positions by reason."""
-    reason = find_invalid(samples, ["x", "y", "z"]).to_numpy()
+    reason = find_invalid_rows(samples, ["x", "y", "z"]).to_numpy()
     return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
 
 

@@ -63,10 +63,10 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
         show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
     contents = result_files(to_json_dict(inventory), json_path)
-    write_and_print(contents, _page(inventory, request))
+    write_and_print(contents, _inventory_page(inventory, request))
 
 
-def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
+def _inventory_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
     from px4fuse.request import command_line

@@ -43,13 +43,17 @@ def _parse_numbers(text: str, syntax: str, max_absolute: float) -> list[float]:
 def parse_landing(text: str) -> Landing:
     """Parse a landing place: ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
     return Landing(
-        *_parse_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M)
+        *_parse_numbers(
+            text, "FORWARD,RIGHT (two distances in m) or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M
+        )
     )
 
 
 def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
-    return GivenClosure(*_parse_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
+    return GivenClosure(
+        *_parse_numbers(text, "T1,T2 (two times in s) or T1,T2,SIGMA (σ in m)", sys.float_info.max)
+    )
 
 
 @click.command()

@@ -66,7 +66,7 @@ def verify(
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
     report_files = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
     contents = report_files | result_files(_verdict_data(content, verdict), json_path)
-    write_and_print(contents, _page(display_name(report), verdict, output))
+    write_and_print(contents, _verification_page(display_name(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
@@ -85,7 +85,7 @@ def _verdict_data(pdf: bytes, verdict: Verification) -> dict[str, object]:
     }
 
 
-def _page(name: str, verdict: Verification, output: Path | None) -> Page:
+def _verification_page(name: str, verdict: Verification, output: Path | None) -> Page:
     from px4fuse.core.text import one_line
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS

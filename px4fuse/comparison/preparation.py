@@ -30,7 +30,7 @@ from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
-    fused_aid,
+    has_fused_aid,
     with_gnss_innovations,
 )
 from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
@@ -185,7 +185,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
     EKF2 then estimates the constant offset of vision, so KF must not see it as a position error.
     """
     ekf2 = flight.ekf2
-    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and fused_aid(ekf2)):
+    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
         return track
     samples = track.samples.copy()
     offset_m = [
@@ -215,7 +215,9 @@ def _use_barometer_height(
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
-    is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
+    is_fused_by_ekf2 = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
+        ekf2, GNSS.vertical
+    )
     uses_barometer = height_name == "barometer" or (
         height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )

@@ -49,9 +49,9 @@ from px4fuse.flight.model import (
 )
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import flight_spans
-from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
+from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
-from px4fuse.readers.px4_topics import DEFAULT_PROFILE
+from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
@@ -383,7 +383,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
-    return GNSS_POS if fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
+    return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
@@ -403,7 +403,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(
-            ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE
+            ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE_REMEDY
         )
     if track.rate_hz < MAX_DOWNSAMPLED_HZ:
         return Unavailable(

@@ -24,7 +24,7 @@ ARDUPILOT_REPLAY = Unavailable(
     "Use the logged state of EKF3.",
 )
 # Messages with the boot time in time_usec; in other messages time_usec may be from another clock
-STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
+BOOT_CLOCK_MESSAGES = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # Messages that only an autopilot sends; they identify the autopilot among the senders
 AUTOPILOT_MESSAGES = (
     "HIGHRES_IMU",
