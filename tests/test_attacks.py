@@ -37,7 +37,7 @@ from px4fuse.report import pdf as pdf_module
 from px4fuse.results.answer_form import form_text
 from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verification
@@ -110,7 +110,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     folder = tmp_path_factory.mktemp("flight")
     scenario = Scenario(passes=4, seed=11, truth=False)
     log, notes, pdf = (folder / name for name in ("s01.ulg", "notes.md", "report.pdf"))
-    simulation = flights.simulate(scenario, parse(MISTAKES))
+    simulation = flights.simulate(scenario, parse_mistakes(MISTAKES))
     log.write_bytes(flights.to_ulog(simulation))
     form = form_text(log.name, hashlib.sha256(log.read_bytes()).hexdigest())
     form = form.replace('kind = ""', 'kind = "nlos"', 1) + GAP

@@ -34,7 +34,7 @@ from px4fuse.results.answer_form import (
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
@@ -185,7 +185,9 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
 def test_correct_size_of_open_loop_end_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
-    (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
+    (wrong,) = form_truth(
+        flights.simulate(scenario, parse_mistakes(("open-end=5m",))), SHA256
+    ).mistakes
     assert wrong.size is not None
     assert wrong.low is not None
     assert 0.1 < abs(wrong.size - 5.0) < 1.5
@@ -201,7 +203,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
     scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
-    return flights.simulate(scenario, parse(given["mistake"]))
+    return flights.simulate(scenario, parse_mistakes(given["mistake"]))
 
 
 def answers_of(form: dict[str, Any]) -> Answers:

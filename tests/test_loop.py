@@ -22,7 +22,7 @@ from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
 from px4fuse.request import GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.model import Kind, Trajectory
+from px4fuse.trajectory.model import Trajectory, TrajectoryKind
 from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
@@ -203,7 +203,7 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
     odometry = noisy_odometry(truth, sigma, np.random.default_rng(seed))
     time = np.arange(len(truth)) / RATE_HZ
 
-    def flown(name: str, kind: Kind, poses: np.ndarray) -> Trajectory:
+    def flown(name: str, kind: TrajectoryKind, poses: np.ndarray) -> Trajectory:
         return Trajectory(name, kind, time, poses[:, :3], Rotation.from_quat(poses[:, 3:]), "NED")
 
     return flown("truth", "truth", truth), flown("laps", "vio", odometry)

@@ -21,9 +21,9 @@ Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from the results of one input to analyse the log of the other input
-_FILTER_SETTINGS = (*Settings.__dataclass_fields__, "axes")
-# Settings that are copied only if both inputs belong to the same log
-_SEGMENT_SETTINGS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
+_FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
+# Settings that are not copied even if both inputs belong to the same log
+_FILE_FIELDS = {"log", "system", "position"}
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _analyse_log(path: Path, other_input: InputResults | None, progress: Progres
     if other_input is not None:
         is_same_log = other_input.results.log.sha256 in files_by_sha256([path])
         copied_settings = (
-            (*_FILTER_SETTINGS, *_SEGMENT_SETTINGS) if is_same_log else _FILTER_SETTINGS
+            {*request.__struct_fields__} - _FILE_FIELDS if is_same_log else _FILTER_SETTINGS
         )
         request = replace(
             request,

@@ -21,7 +21,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
-from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
 # Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
 CorrectionName = Literal[
@@ -91,7 +91,7 @@ class Closure(Record, frozen=True, kw_only=True):
     time_2_s: float
     # σ of the displacement between the two times, per axis
     sigma_m: NotNegative
-    # "landing" for the closure of take-off and landing, "given" for ``--closure``
+    # "landing" for the closure between take-off and landing, "given" for ``--closure``
     source: str
     # Closure error: displacement from odometry minus true displacement
     distance_m: NotNegative
@@ -144,7 +144,7 @@ class Loop(Record, frozen=True, kw_only=True):
     """
 
     track: str
-    kind: Kind
+    kind: TrajectoryKind
     frame: Frame
     start_s: float
     end_s: float
@@ -173,7 +173,7 @@ class Loop(Record, frozen=True, kw_only=True):
 
     @property
     def odometry(self) -> CorrectedPath:
-        """Uncorrected path from take-off to landing, in a frame with z down."""
+        """Odometry from take-off to landing, without correction, in a frame with z down."""
         return self.paths["uncorrected"]
 
     @property

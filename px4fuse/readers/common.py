@@ -56,8 +56,11 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
-    place = f"{unit} in flight" if in_flight else unit
-    return f"the file ends within a {place} after {duration_s:.1f} s; later data are missing"
+    flight_text = ", in flight" if in_flight else ""
+    return (
+        f"the file ends within a {unit} after {duration_s:.1f} s{flight_text}; later data are "
+        "missing"
+    )
 
 
 def finite_rows(

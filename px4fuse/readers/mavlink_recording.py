@@ -262,8 +262,8 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         )
         notes.append(
             f"restarts of the boot clock: {len(restart_rows)}; only session {session_index + 1} "
-            f"is analysed, from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot ({used_fraction:.0%} of the "
-            "data)"
+            f"is analysed, from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
+            f"({used_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))

@@ -24,7 +24,7 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 
 # True values of the simulation that the answer key lists
 TRUTH_NAMES = (
@@ -43,7 +43,9 @@ def simulate_assigned(
 ) -> tuple[bytes, Answer]:
     """Simulate the flight of one student, and return the log (ULog) with the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
-    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
+    simulation = flights.simulate(
+        assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
+    )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.core.record import Record, read_toml
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
+from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
 # Kind of the flights of a class; for "mixed", aisle or loop is drawn for each student
 FlightKind = Literal["aisle", "loop", "mixed"]
@@ -31,7 +31,10 @@ DRAW_LABEL = "px4fuse assignment 2"
 # Fractions of flights with 0, 1 and 2 injected faults, unless --mistakes sets the number. The only
 # possible injected fault of a loop is "open-end". Many loops have no injected fault, so that
 # students cannot guess "open-end"
-COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
+COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
+    "aisle": (0.1, 0.5, 0.4),
+    "loop": (0.4, 0.6),
+}
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
 # Range of the difficulty of an injected fault: smallest size that px4fuse detects, divided by the
@@ -102,7 +105,7 @@ class DrawingRules(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = read_toml(__file__, "drawn.toml", dict[Kind, DrawingRules])
+RULES_BY_KIND = read_toml(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
 
 
 @dataclass(frozen=True)

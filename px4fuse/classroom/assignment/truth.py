@@ -181,7 +181,7 @@ def draw_predictions(
 def _true_mistake(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> TrueMistake:
-    sizes = SIMULATED_MISTAKES[name].sizes
+    sizes = SIMULATED_MISTAKES[name].size_fields
     if not sizes:
         return TrueMistake(name)
     size = values[sizes[0]]

@@ -104,9 +104,9 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     different units, so the matrix is scaled to unit diagonal first.
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
-    values, vectors = np.linalg.eigh(scaled_information)
-    is_observed = values > MIN_OBSERVED_EIGENVALUE
-    return scale[:, None] * vectors[:, is_observed], 1.0 / values[is_observed]
+    eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
+    is_observed = eigenvalues > MIN_OBSERVED_EIGENVALUE
+    return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
