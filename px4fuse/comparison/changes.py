@@ -64,14 +64,17 @@ def candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
     inputs: Inputs | None,
-    result: AxisComparison,
+    axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
     """Return the changes that may explain a mean NIS or NEES (``statistic``) outside its limits."""
-    summary, origin = result.filters["kf" if inputs is None else "ekf2"], comparison.source.origin
+    summary, origin = (
+        axis_result.filters["kf" if inputs is None else "ekf2"],
+        comparison.source.origin,
+    )
     assert isinstance(summary, FilterSummary)  # only a tested filter has a discrepancy
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
-    axis_tuning = tuning_of_axis(estimates.tuning, result.axis.name)
+    axis_tuning = tuning_of_axis(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
     # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
     # smaller noise
@@ -88,7 +91,7 @@ def candidate_changes(
         {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
     )
     changes += [delay_parameters] if delay_parameters else _time_offset(estimates, inputs)
-    if result.axis.name == "down":
+    if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
         is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
@@ -137,19 +140,21 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
     if inputs is not None:
         aid = inputs.aid
         kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
-    names = [name for name in change if name not in ACCOMPANYING_CHANGES]
+    changed_names = [name for name in change if name not in ACCOMPANYING_CHANGES]
     return tuple(
-        dict.fromkeys(KF_KINDS.get(name) or kinds.get(name, "process noise") for name in names)
+        dict.fromkeys(
+            KF_KINDS.get(name) or kinds.get(name, "process noise") for name in changed_names
+        )
     )
 
 
 def default_settings(comparison: Comparison) -> Change:
     """Return KF's default noises in place of the values that the user chose."""
     chosen_settings, px4fuse_default = comparison.settings, Settings()
-    names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
+    setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
         name: getattr(px4fuse_default, name)
-        for name in names
+        for name in setting_names
         if getattr(chosen_settings, name) != getattr(px4fuse_default, name)
     }
 
@@ -164,14 +169,16 @@ def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
     """
-    clock = estimates.clock
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    clock_offset = estimates.clock
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return []
-    if not clock.is_significant(clock.remaining_s if inputs is None else clock.offset_s):
+    if not clock_offset.is_significant(
+        clock_offset.remaining_s if inputs is None else clock_offset.offset_s
+    ):
         return []
-    change = {CLOCK_OFFSET: round(clock.offset_s, 3)}
+    change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
     if inputs is not None:
-        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock.offset_s
+        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock_offset.offset_s
         change |= horizon_change(inputs.settings, age_ms)
     return [change]
 

@@ -60,7 +60,7 @@ def find_noisy_part(
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    axes = [result.axis for result in north_and_east(comparison)]
+    axes = [axis_result.axis for axis_result in north_and_east(comparison)]
     if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
     increments_by_axis = [preintegrate(line, settings) for line in axes]

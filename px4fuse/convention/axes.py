@@ -101,15 +101,15 @@ class Family(NamedTuple):
 
     def axes(self, quarter: int) -> Axes:
         """Return the directions of x, y, z with ``axis_a`` at ``quarter`` · 90° from north."""
-        names: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        names[self.axis_a] = CLOCKWISE[quarter % 4]
-        names[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
-        return names[0], names[1], names[2]
+        directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
+        directions[self.axis_a] = CLOCKWISE[quarter % 4]
+        directions[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
+        return directions[0], directions[1], directions[2]
 
     def log_odds(self, quarter: int) -> float:
         axes = self.axes(quarter)
-        other = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other)
+        other_axes_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
+        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_odds)
 
 
 FAMILIES = tuple(

@@ -148,9 +148,9 @@ def read_inertial(flight: Flight) -> Inertial | None:
     gap_rows = np.flatnonzero(imu_gaps(imu_s))
     recorded_spans_s = zip([-np.inf, *imu_s[gap_rows + 1]], [*imu_s[gap_rows], np.inf], strict=True)
     valid_spans_s = (
-        (max(start, begin), min(stop, end))
-        for begin, end in recorded_spans_s
-        for start, stop in airborne
+        (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
+        for recorded_from_s, recorded_until_s in recorded_spans_s
+        for flight_start_s, flight_end_s in airborne
     )
     return Inertial(
         time_s,
@@ -231,11 +231,11 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     )
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
-    position = np.zeros((len(attitude), 3, 4))
-    velocity = np.cumsum(table, axis=0) * STEP_S
-    np.cumsum((velocity - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
+    position_m = np.zeros((len(attitude), 3, 4))
+    velocity_m_s = np.cumsum(table, axis=0) * STEP_S
+    np.cumsum((velocity_m_s - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position_m[1:])
     window_steps, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
-    second_differences = second_difference(position, window_steps)[::stride]
+    second_differences = second_difference(position_m, window_steps)[::stride]
     time_s = inertial.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)

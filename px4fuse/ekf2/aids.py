@@ -188,7 +188,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     samples = aid_log.samples.loc[start_s:end_s]
     sample_s = samples.index.to_numpy()
     gate = _effective_gate(aid, aid_log)
-    innovation, variance = (
+    innovation, innovation_variance = (
         samples[[f"{quantity}_{axis}" for axis in aid_log.axes]].to_numpy()
         for quantity in ("innovation", "variance")
     )
@@ -206,12 +206,12 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_fused, is_rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise_sigma = samples[[f"noise_{axis}" for axis in aid_log.axes]].to_numpy()
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
-        is_reset = ((innovation == 0.0) & np.isclose(variance, noise_sigma)).all(axis=1)
+        is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
         noise_median = (
             float(np.median(np.sqrt(noise_sigma[is_fused, 0]))) if is_fused.any() else None
         )
     else:
-        is_rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
+        is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
         is_reset = np.zeros(len(samples), bool)
         noise_median = None
@@ -220,7 +220,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
         consistency = assess(
-            innovation[is_evaluated, axis_index], variance[is_evaluated, axis_index], gate
+            innovation[is_evaluated, axis_index],
+            innovation_variance[is_evaluated, axis_index],
+            gate,
         )
         if not isinstance(consistency, Unavailable):
             axes[axis] = AidAxis(
@@ -238,7 +240,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 change=_largest_mean_change(
                     sample_s[is_evaluated],
                     innovation[is_evaluated, axis_index]
-                    / np.sqrt(variance[is_evaluated, axis_index]),
+                    / np.sqrt(innovation_variance[is_evaluated, axis_index]),
                 ),
             )
     return AidResult(
@@ -302,17 +304,17 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _noise_origin(aid: Aid, aid_log: AidLog, noise: float | None) -> str:
+def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the parameter whose value is √R, else the origin stated for the source."""
     parameter_value = aid_log.parameters.get(aid.noise)
-    if noise is None or parameter_value is None:
-        return "" if noise is None else aid.noise_origin
+    if noise_sigma is None or parameter_value is None:
+        return "" if noise_sigma is None else aid.noise_origin
     for expected_noise in (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
         np.sqrt(parameter_value),
     ):
-        if abs(noise - expected_noise) <= NOISE_TOLERANCE * expected_noise:
+        if abs(noise_sigma - expected_noise) <= NOISE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
 

@@ -585,9 +585,9 @@ def _logged_decisions(
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
-        rows = np.flatnonzero(is_recent & may_reset)
-        ends_here = np.intersect1d(rows, dead_reckoning_ends)
-        is_reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
+        reset_rows = np.flatnonzero(is_recent & may_reset)
+        ends_here = np.intersect1d(reset_rows, dead_reckoning_ends)
+        is_reset[ends_here[:1] if len(ends_here) else reset_rows[-1:]] = True
     is_fused = np.zeros(len(is_reset), bool)
     is_fused[last_fused_rows[last_fused_rows >= 0]] = True
     rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0
@@ -604,9 +604,9 @@ def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     vision_enabled_steps = ekf2.states.get(EV_POS.name)
     if dead_reckoning_steps is None or vision_enabled_steps is None:
         return np.zeros((0, 2))
-    spans = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
-    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans[:, 0]) > 0.0)
-    return spans
+    spans_s = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
+    spans_s[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans_s[:, 0]) > 0.0)
+    return spans_s
 
 
 def aid_source(aid: Aid) -> str:
@@ -616,9 +616,11 @@ def aid_source(aid: Aid) -> str:
 
 def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
     """Return the index of the sample at each measurement time; -1 without a sample."""
-    row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
-    row = np.minimum(row, len(sample_s) - 1)
-    return np.where(np.abs(sample_s[row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, row, -1)
+    sample_row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
+    sample_row = np.minimum(sample_row, len(sample_s) - 1)
+    return np.where(
+        np.abs(sample_s[sample_row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, sample_row, -1
+    )
 
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:

@@ -226,20 +226,20 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     return np.concatenate(effects, axis=1)
 
 
-def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
+def _noises(step_counts: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
     """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
 
     The noise is summed over the prediction steps: a step of length d adds d² to the variance of
     attitude or velocity. The specific force is the mean of the interval. For velocity and position,
     only the leading terms of the gyro noise are used.
     """
-    n = np.maximum(steps, 1.0)[:, None, None]
+    n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
     # effect of the attitude error on the velocity, in one of n equal steps
     m = tilt / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))
+    gyro, accelerometer = np.zeros((2, len(step_counts), IMU_STATE_COUNT, IMU_STATE_COUNT))
     for matrix, rows, columns, block in (
         (gyro, THETA, THETA, n * d**2 * eye),
         (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),

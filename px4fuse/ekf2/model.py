@@ -337,23 +337,23 @@ def run_configurations(
 ) -> list[SegmentRun]:
     """Run filter configurations through every segment; ``computed_intervals`` are reused."""
     timings = [configuration.timing(inputs) for configuration in configurations]
-    runs = []
+    segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
         intervals = {
             timing: by_segment[segment_index] for timing, by_segment in computed_intervals.items()
         }
         for timing in set(timings) - computed_intervals.keys():
             intervals[timing] = make_intervals(inputs, segment, timing)
-        runs.append(
+        segment_runs.append(
             run_segment(inputs, segment, configurations, [intervals[timing] for timing in timings])
         )
-    return runs
+    return segment_runs
 
 
 def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
     index = pd.Index(run.segment.time_s, name="time_s")
-    position = state[:, POSITION] / run.segment.ekf2_metres_per_metre
-    return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
+    position_m = state[:, POSITION] / run.segment.ekf2_metres_per_metre
+    return pd.DataFrame(np.hstack([position_m, state[:, VELOCITY]]), index, Columns.STATE)
 
 
 def _make_replay(

@@ -219,16 +219,16 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     @property
     def evaluated_s(self) -> Spans:
         """Spans (s) of the replay, without the first seconds and times with optical flow only."""
-        spans = []
+        evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
             for flow_start, flow_end in self.flow_only_spans_s:
                 if begin < flow_start < end:
-                    spans.append((begin, flow_start))
+                    evaluated_spans_s.append((begin, flow_start))
                     begin = flow_end + SETTLING_S
             if begin < end:
-                spans.append((begin, end))
-        return tuple(spans)
+                evaluated_spans_s.append((begin, end))
+        return tuple(evaluated_spans_s)
 
 
 class _ComparedInnovations(NamedTuple):
@@ -446,12 +446,12 @@ def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable])
     return pd.DataFrame(columns).dropna()
 
 
-def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
+def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
     """Return True for each time inside one of the spans."""
-    times = np.asarray(times_s)
-    is_inside = np.zeros(times.shape, bool)
-    for start, end in spans:
-        is_inside |= (times > start) & (times < end)
+    times_array_s = np.asarray(times_s)
+    is_inside = np.zeros(times_array_s.shape, bool)
+    for start, end in spans_s:
+        is_inside |= (times_array_s > start) & (times_array_s < end)
     return is_inside
 
 
@@ -473,19 +473,27 @@ def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool)
 
 
 def _axis_agreement(
-    axis: AxisName, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
+    axis: AxisName,
+    logged_innovations: pd.DataFrame,
+    replayed_innovations: pd.DataFrame,
+    ekf2: Ekf2,
+    ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log = (innovations[f"innovation_{axis}_m"].to_numpy() for innovations in (model, log))
+    nu, nu_log = (
+        innovations[f"innovation_{axis}_m"].to_numpy()
+        for innovations in (replayed_innovations, logged_innovations)
+    )
     S, S_log = (
-        innovations[f"innovation_variance_{axis}_m2"].to_numpy() for innovations in (model, log)
+        innovations[f"innovation_variance_{axis}_m2"].to_numpy()
+        for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
     evaluated_state_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, replay.evaluated_s)
+        inside_spans(ekf2.state.index, ekf2_replay.evaluated_s)
     ].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
-    position, velocity = (
-        component_along(replay.published, columns, direction, evaluated_state_s)
+    position_m, velocity_m_s = (
+        component_along(ekf2_replay.published, columns, direction, evaluated_state_s)
         - component_along(ekf2.state, columns, direction, evaluated_state_s)
         for columns in (Columns.POSITION, Columns.VELOCITY)
     )
@@ -497,8 +505,8 @@ def _axis_agreement(
         s_ratio_p95=s_ratio_p95,
         nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
-        position_rms_difference_m=rms(position),
-        velocity_rms_difference_m_s=rms(velocity),
+        position_rms_difference_m=rms(position_m),
+        velocity_rms_difference_m_s=rms(velocity_m_s),
     )
 
 
@@ -566,17 +574,18 @@ def _agreement_verdict(
     nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
-    text = (
+    tolerance_text = (
         f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
         f"the mean NIS differs by {nis_difference:.0%}"
     )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis_difference > MAX_NIS_DIFFERENCE:
         return False, (
-            f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
+            f"{tolerance_text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
     return (
         True,
-        f"{text}; single innovations are not compared, because rejections change later ones",
+        f"{tolerance_text}; single innovations are not compared, because rejections change later "
+        "ones",
     )
 
 

@@ -283,13 +283,18 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
         SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
         TIMESTAMPS: kf_configuration,
         NOISE: (
-            noise := replace(kf_configuration, settings=kf_process_noise, uses_reported_noise=True)
+            noise_configuration := replace(
+                kf_configuration, settings=kf_process_noise, uses_reported_noise=True
+            )
         ),
-        BIASES: replace(noise, estimates_biases=True),
-        PROCESS: replace(noise, settings=flown_settings, estimates_biases=True),
+        BIASES: replace(noise_configuration, estimates_biases=True),
+        PROCESS: replace(noise_configuration, settings=flown_settings, estimates_biases=True),
         ATTITUDE: (
             configuration := replace(
-                noise, settings=flown_settings, estimates_biases=True, estimates_attitude=True
+                noise_configuration,
+                settings=flown_settings,
+                estimates_biases=True,
+                estimates_attitude=True,
             )
         ),
     }
@@ -308,9 +313,9 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 
 
 def _longest_rejection(
-    flown_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans: Spans
+    flown_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
-    updates = flown_replay.updates[inside_spans(flown_replay.updates.index, spans)]
+    updates = flown_replay.updates[inside_spans(flown_replay.updates.index, spans_s)]
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fused_at_s = updates["fused_at_s"].to_numpy()

@@ -299,9 +299,9 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
         raise SettingsError(
             f"{count} parameter values for a sweep: give a number from 2 to {MAX_SWEEP_VALUES}."
         )
-    values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
-    values[[0, -1]] = low, high
-    return [float(value) for value in values]
+    sweep = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
+    sweep[[0, -1]] = low, high
+    return [float(value) for value in sweep]
 
 
 def _mark_unpredictable(
@@ -315,10 +315,10 @@ def _mark_unpredictable(
         if repeated_runs[0].changed
         and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
-    for seed in range(ADDED_NOISE_RUNS if changes else 0):
+    uncertain_changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
+    for seed in range(ADDED_NOISE_RUNS if uncertain_changes else 0):
         noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
-        replays = replay_settings(noisy_model, changes, without=without)
+        replays = replay_settings(noisy_model, uncertain_changes, without=without)
         for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
             repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     marked_summaries = []
@@ -347,7 +347,7 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
     nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
     return (
-        all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis_by_axis)
+        all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
         and (not rmse_values or max(rmse_values) <= MAX_RMSE_RATIO * min(rmse_values))
     )

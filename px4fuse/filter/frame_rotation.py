@@ -196,13 +196,13 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
     rows_of_parts = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
         HeadingPart(
-            start_s=float(time_s[rows[0]]),
-            end_s=float(time_s[rows[-1]]),
-            heading_error_deg=float(np.degrees(rotation_rad[rows].mean())),
-            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[rows] ** 2)))),
+            start_s=float(time_s[part_rows[0]]),
+            end_s=float(time_s[part_rows[-1]]),
+            heading_error_deg=float(np.degrees(rotation_rad[part_rows].mean())),
+            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
-        for rows in rows_of_parts
-        if len(rows) >= MIN_PART_SAMPLES
+        for part_rows in rows_of_parts
+        if len(part_rows) >= MIN_PART_SAMPLES
     )
 
 
@@ -290,9 +290,9 @@ def _estimate_from_positions(
         noises = maximise_likelihood(
             [part_positions], noises, motion.weight, fits_outliers=False
         ).noises
-        fit = fit_noises([part_positions], noises, motion.weight)
-        constants = fit.constants()[is_long, 0]
-        constant_covariance = np.linalg.inv(fit.information())[is_long, 0]
+        fitted_positions = fit_noises([part_positions], noises, motion.weight)
+        constants = fitted_positions.constants()[is_long, 0]
+        constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
         # the path has the scale of the positions, which is estimated too
         position_scale = np.maximum(1.0 + constants[:, -1], MIN_SCALE)
         error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale

@@ -164,8 +164,8 @@ def fit_systematic_errors(
     if isinstance(design, Unavailable):
         return design
     is_skipped = np.isin(axes[0].measurement_time_s[-len(design.time_s) :], outlier_time_s)
-    if (count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
-        return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
+    if (used_count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
+        return too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
     sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
     jumps, is_skipped = _find_jumps(
