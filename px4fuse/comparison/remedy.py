@@ -29,14 +29,16 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     """Estimate the delay of GNSS and its σ (ms), if EKF2 fused vision and GNSS velocity.
 
     The delay minimises the NIS of GNSS in re-runs of EKF2 with other values of EKF2_GPS_DELAY.
-    Return None if it does not differ significantly from the flown delay.
+    Return None if it does not differ significantly from the logged delay.
     """
     received = model.inputs.received
     if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
         return None
     nis_sums = []
     for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
-        updates = replay.updates[inside_spans(replay.updates.index, model.flown.evaluated_s)]
+        updates = replay.updates[
+            inside_spans(replay.updates.index, model.baseline_replay.evaluated_s)
+        ]
         nis = [
             updates[f"innovation_{axis}_{unit}"] ** 2
             / updates[f"innovation_variance_{axis}_{variance_unit}"]

@@ -222,7 +222,7 @@ def _try_changes(
     changes = _changes_along(comparison, estimates, tested_filter.inputs, axis_result)
     if not changes:
         return []
-    before, is_logged = _flown_statistics(tested_filter, axis_result)
+    before, is_logged = _unchanged_statistics(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         after = tested_filter.rerun(axis_result, change)
@@ -241,7 +241,7 @@ def _try_changes(
             after=after,
             from_s=None
             if tested_filter.model is None
-            else tested_filter.model.flown.evaluated_s[0][0],
+            else tested_filter.model.baseline_replay.evaluated_s[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -254,17 +254,17 @@ def _try_changes(
     return trials
 
 
-def _flown_statistics(
+def _unchanged_statistics(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter as flown, and False if they are from EKF2's replay."""
+    """Return the statistics of the logged filter, and False if they are from EKF2's replay."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.model is None:
         return replayed_statistics, True
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.flown.evaluated_s
+    compared_s = tested_filter.model.baseline_replay.evaluated_s
     compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
     innovations = innovations[inside_spans(innovations.index, compared_s)]
     rejected_flags = innovations["rejected"].dropna()
@@ -373,7 +373,7 @@ def _replay_ekf2(
     comparison: Comparison, tuning: Tuning, model: Model, change: Change
 ) -> Ekf2Replay:
     if not change:
-        return model.flown
+        return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
@@ -395,7 +395,7 @@ def _replay_statistics(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    compared_s, axis = model.flown.evaluated_s, axis_result.axis
+    compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))

@@ -74,7 +74,7 @@ class Trial(Record, frozen=True, kw_only=True):
     discrepancies : tuple of {"nis", "nees"}
         Statistics outside their limits that the change may correct.
     before, after : RunStatistics
-        Statistics as flown and with the change, over the same samples.
+        Statistics without and with the change, over the same samples.
     is_logged : bool
         False if ``before`` is from a replay of EKF2 instead of the log.
     from_s : float or None

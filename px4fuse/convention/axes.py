@@ -338,7 +338,7 @@ def _evaluate(
     if independent_count * WINDOW_S < MIN_OVERLAP_S:
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     grid_index, time_s = grid_index[is_used], time_s[is_used]
-    flown_s = time_s - time_s[0]
+    elapsed_s = time_s - time_s[0]
     grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
     imu_table = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
@@ -348,7 +348,7 @@ def _evaluate(
         hypothesis.family,
     )
     unit_m = UNITS[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * flown_s))
+    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -387,7 +387,7 @@ def _evaluate(
     jacobian = np.zeros((len(grid_index), 3, len(PRECISION)))
     jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
-    jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
+    jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = imu_table[..., 1:]
     is_drifting = hypothesis.heading_from != "EKF2"

@@ -435,9 +435,9 @@ def read_gnss(
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
     # the track has measurement times, from which the replay subtracts the delay again
-    flown_settings = effective_settings(parameters, GNSS_POS)
-    flown_s = flown_settings[GNSS_POS.delay] * 1e-3
-    timestamp_s = position_samples.index.to_numpy() + flown_s
+    logged_settings = effective_settings(parameters, GNSS_POS)
+    logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
+    timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # upper limit (m) of the reported position noise in EKF2 (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = (
@@ -456,7 +456,7 @@ def read_gnss(
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
-        uses_sender_times=track.age_s == 0.0 != flown_s,
+        uses_sender_times=track.age_s == 0.0 != logged_delay_s,
     )
 
 

@@ -84,7 +84,7 @@ class Model:
     ----------
     intervals : mapping from Timing to tuple of Intervals
         Intervals of each segment that were already computed.
-    flown : Ekf2Replay
+    baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
         Results of the filter configurations that were already run, per segment.
@@ -93,7 +93,7 @@ class Model:
     flight: Flight
     inputs: Inputs
     intervals: Mapping[Timing, tuple[Intervals, ...]]
-    flown: Ekf2Replay
+    baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
 
@@ -132,21 +132,21 @@ def _open_without_aids(
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss_innovations(flight.ekf2))
-    flown_configuration = FilterConfiguration(inputs.settings)
-    timing = flown_configuration.timing(inputs)
+    baseline_configuration = FilterConfiguration(inputs.settings)
+    timing = baseline_configuration.timing(inputs)
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
     segments = tuple(with_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
-    configurations = [flown_configuration]
+    configurations = [baseline_configuration]
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
     runs = run_configurations(inputs, configurations, intervals_by_timing)
-    flown_replay = _make_replay(inputs, runs, flown_configuration, {})
-    agreement = agreement_with_log(flight, flown_replay)
+    baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
+    agreement = agreement_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Model(flight, inputs, intervals_by_timing, flown_replay, agreement, tuple(runs))
+    model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if rejected_share > MAX_COMPARED_REJECTIONS and np.isfinite(inputs.received.rejected).any():
         with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
@@ -161,7 +161,9 @@ def _open_without_aids(
         agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_fields
     )
     return replace(
-        model, flown=structs.replace(flown_replay, agreement=agreement), agreement=agreement
+        model,
+        baseline_replay=structs.replace(baseline_replay, agreement=agreement),
+        agreement=agreement,
     )
 
 

@@ -1,6 +1,6 @@
 """Comparison of EKF2 as logged, replayed, and replayed with other parameters.
 
-All columns of this what-if table are evaluated over the same times.
+All columns of this parameter table are evaluated over the same times.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
-ANALYSIS_NAME = "EKF2 what-if"
+ANALYSIS_NAME = "EKF2 replay with other parameters"
 # Minimum fraction of the replayed innovations in the log for a logged time between fusions
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
@@ -87,7 +87,7 @@ MAX_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record, frozen=True):
-    """EKF2 statistics along one axis in one column of the what-if table.
+    """EKF2 statistics along one axis in one column of the parameter table.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
     """
@@ -116,7 +116,7 @@ class HeightSummary(Record, frozen=True):
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """EKF2 statistics in one column of the what-if table: logged, replayed, or changed.
+    """EKF2 statistics in one column of the parameter table: logged, replayed, or changed.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ def what_if(
     without = without or {}
     replays = replay_settings(model, settings, without=without)
     flight = model.flight
-    evaluated_s = model.flown.evaluated_s
+    evaluated_s = model.baseline_replay.evaluated_s
     if without:
         disabled_s = min(without.values())
         # later segments start from logged states, which the source affected
@@ -234,14 +234,14 @@ def what_if(
         if not evaluated_s:
             raise SettingsError(
                 f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
-                "earlier time."
+                f"flight, which ends at {model.baseline_replay.evaluated_s[-1][1]:.0f} s. "
+                "Choose an earlier time."
             )
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_summarise_log(flight, model.flown, evaluated_s),
-        replayed=_summarise_replay(flight, model.flown, evaluated_s),
+        logged=_summarise_log(flight, model.baseline_replay, evaluated_s),
+        replayed=_summarise_replay(flight, model.baseline_replay, evaluated_s),
         whatif=_mark_unpredictable(
             model,
             [_summarise_replay(flight, r, evaluated_s) for r in replays],
@@ -459,7 +459,7 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """Compute one column of the what-if table; ``more`` are further fields of :class:`Summary`.
+    """Compute one column of the parameter table; ``more`` are further fields of :class:`Summary`.
 
     Without ``variance``, the logged position variance is used.
     """
@@ -557,7 +557,7 @@ def _deviation_note(
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = (
-        replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
+        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION]
     )
     position_difference_m = position_difference_m[
         inside_spans(position_difference_m.index, evaluated_s)
@@ -565,7 +565,7 @@ def _deviation_note(
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
-    height_aids = {*model.flown.other_aid_updates} - {EV_POS.name}
+    height_aids = {*model.baseline_replay.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     height_note = (
         f". The published height differs by at most {down_difference_m.max():.3g} m"
@@ -604,4 +604,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
 
 
 def _change_text(replay: Ekf2Replay) -> str:
-    return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"
+    return (
+        ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        or "Logged parameters"
+    )
