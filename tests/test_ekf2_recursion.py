@@ -31,7 +31,7 @@ from px4fuse.ekf2.intervals import (
     START,
     Timing,
     _actions,
-    _events,
+    _make_events,
     _noises,
     make_intervals,
 )
@@ -456,7 +456,7 @@ def events(
     inputs = made(
         Inputs, received=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
     )
-    return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
+    return _make_events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
 def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():

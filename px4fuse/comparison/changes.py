@@ -81,26 +81,26 @@ def candidate_changes(
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
         changes += (
-            _kf_noises(comparison.settings, axis_tuning, is_underconfident)
+            _kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
             if inputs is None
-            else _ekf2_noise(inputs, summary, axis_tuning)
+            else _ekf2_noise_changes(inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
         {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
     )
-    changes += [delay_parameters] if delay_parameters else _time_offset(estimates, inputs)
+    changes += [delay_parameters] if delay_parameters else _time_offset_changes(estimates, inputs)
     if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
         is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if inputs is None:
-        return changes + _without_bias(estimates)
-    changes += _px4_defaults(comparison.flight.log, inputs)
+        return changes + _bias_changes(estimates)
+    changes += _px4_default_changes(comparison.flight.log, inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _vibration_noise(comparison.settings, inputs, axis_tuning)
+        changes += _vibration_noise_changes(comparison.settings, inputs, axis_tuning)
     return changes
 
 
@@ -119,7 +119,7 @@ def main_axis_changes(
     )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
-        offset_changes = _time_offset(estimates, inputs) if has_delay else []
+        offset_changes = _time_offset_changes(estimates, inputs) if has_delay else []
         return unique_changes([*changes, *offset_changes])
     noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noise_changes) > 1:
@@ -164,7 +164,7 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
+def _time_offset_changes(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset if a significant part of it is not yet applied.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
@@ -183,7 +183,7 @@ def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
     return [change]
 
 
-def _kf_noises(
+def _kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
     """Return the noise estimates that differ significantly from the settings."""
@@ -203,7 +203,7 @@ def _kf_noises(
     return changes
 
 
-def _without_bias(estimates: Estimates) -> list[Change]:
+def _bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
         return []
@@ -214,7 +214,9 @@ def _without_bias(estimates: Estimates) -> list[Change]:
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
 
-def _ekf2_noise(inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning) -> list[Change]:
+def _ekf2_noise_changes(
+    inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
+) -> list[Change]:
     """Return EKF2 parameters for the estimated position noise, if it differs significantly."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
@@ -223,7 +225,7 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning)
     return [change] if change else []
 
 
-def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
+def _px4_default_changes(log: LogInfo, inputs: Inputs) -> list[Change]:
     """Return PX4's default of each changed noise, and of a gate below PX4's default."""
     gate, logged_parameters = inputs.aid.gate, inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
@@ -236,7 +238,9 @@ def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
     ]
 
 
-def _vibration_noise(settings: Settings, inputs: Inputs, axis_tuning: AxisTuning) -> list[Change]:
+def _vibration_noise_changes(
+    settings: Settings, inputs: Inputs, axis_tuning: AxisTuning
+) -> list[Change]:
     """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²

@@ -66,7 +66,7 @@ def explain_ekf2_difference(
         return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in axis_results}
-    kf_settings = _settings(comparison, model.inputs, estimated_noises)
+    kf_settings = _comparable_settings(comparison, model.inputs, estimated_noises)
     changed_settings = replace(comparison.settings, **estimated_noises)
     kf_runs = {
         name: replay(axis.axis, changed_settings, fast=True) if estimated_noises else axis.replay
@@ -118,11 +118,15 @@ def explanation_configurations(
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
     return list(
-        steps.step_configurations(inputs, _settings(comparison, inputs, corrected)).values()
+        steps.step_configurations(
+            inputs, _comparable_settings(comparison, inputs, corrected)
+        ).values()
     )
 
 
-def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]) -> Settings:
+def _comparable_settings(
+    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]
+) -> Settings:
     settings = replace(comparison.settings, **corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)

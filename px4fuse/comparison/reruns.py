@@ -268,7 +268,7 @@ def _unchanged_statistics(
     compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
     innovations = innovations[inside_spans(innovations.index, compared_s)]
     rejected_flags = innovations["rejected"].dropna()
-    logged_statistics = _statistics(
+    logged_statistics = _run_statistics(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
@@ -288,7 +288,7 @@ def _unchanged_statistics(
     return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
 
 
-def _statistics(
+def _run_statistics(
     innovation_m: Array,
     variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
@@ -346,7 +346,7 @@ def _rerun_kf(
         measurement_m=axis.measurement_m[is_used],
     )
     kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
-    return _statistics(
+    return _run_statistics(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
         kf_error_statistics(kf_run, truth, ekf2_state),
@@ -418,7 +418,7 @@ def _replay_statistics(
     logged_state, compared_track = axis_result.ekf2_state, published
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = logged_state[inside_spans(logged_state.index, compared_s)]
-    return _statistics(
+    return _run_statistics(
         weighted_sum(ekf2_updates, UPDATE_COLUMNS[:2], direction_cosines),
         innovation_variance_m2,
         error_statistics(published, variance_by_time, axis_result.truth),

@@ -128,7 +128,7 @@ class SentPositions:
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "SentPositions":
-        return replace(self, time_s=without_drift(self.time_s, drift))
+        return replace(self, time_s=without_clock_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
@@ -196,7 +196,7 @@ class Hypothesis:
         return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
 
 
-def without_drift(time_s: Array, drift: float) -> Array:
+def without_clock_drift(time_s: Array, drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
     middle_s = float(np.mean(time_s))
     return middle_s + (time_s - middle_s) / (1.0 + drift)
@@ -214,14 +214,18 @@ def search(
         source_motion = positions.motion(imu_motion)
         for candidate in find_candidates(source_motion, imu_motion):
             start_hypothesis = replace(candidate, heading_from=heading_from)
-            hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
+            hypotheses.append(
+                refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
+            )
             if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
                 parameters = start_hypothesis.parameters.copy()
                 parameters[1] -= candidate.remainder_rad
                 start_hypothesis = replace(
                     start_hypothesis, parameters=parameters, has_rotation=False
                 )
-                hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
+                hypotheses.append(
+                    refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
+                )
     return sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
@@ -302,7 +306,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     ]
 
 
-def refine(
+def refine_hypothesis(
     start: Hypothesis, positions: SentPositions, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
@@ -310,7 +314,7 @@ def refine(
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
     best, parameters = replace(start, score=-np.inf), start.parameters
     for _ in range(ITERATIONS):
-        hypothesis, step = _evaluate(
+        hypothesis, step = _evaluate_hypothesis(
             replace(start, parameters=parameters), rows, source_motion, imu_motion
         )
         if hypothesis.score > best.score:
@@ -319,7 +323,7 @@ def refine(
     return replace(best, score=best.score + _log_odds(best, positions))
 
 
-def _evaluate(
+def _evaluate_hypothesis(
     hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""

@@ -12,7 +12,7 @@ from px4fuse.convention.axes import (
     Hypothesis,
     SentPositions,
     find_candidates,
-    refine,
+    refine_hypothesis,
     search,
 )
 from px4fuse.convention.model import (
@@ -87,17 +87,17 @@ def check_convention(
     motions = {
         name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
     }
-    hypotheses = _search(positions, motions)
+    hypotheses = _search_hypotheses(positions, motions)
     if not hypotheses:
         return Convention(verdict="not determinable")
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.with_clock_drift(clock_drift)
-        with_drift = _search(positions_without_drift, motions)
+        with_drift = _search_hypotheses(positions_without_drift, motions)
         if with_drift and with_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN:
             hypotheses, positions = with_drift, positions_without_drift
         else:
             clock_drift = 0.0
-    convention = _decide(hypotheses, positions, clock_drift)
+    convention = _choose_convention(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
     orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
@@ -121,7 +121,9 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     )
 
 
-def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
+def _search_hypotheses(
+    positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
+) -> list[Hypothesis]:
     """Return the likely conventions, best first; the logged heading is preferred."""
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
@@ -135,7 +137,7 @@ def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -
     return hypotheses
 
 
-def _decide(
+def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
     """Decide whether the best convention is unambiguous and its residuals are plausible."""
@@ -164,7 +166,7 @@ def _decide(
         verdict = "doubtful"
     x, y, z = best_hypothesis.axes
     likely_conventions = [
-        _describe(hypothesis)
+        _describe_hypothesis(hypothesis)
         for hypothesis in other_conventions
         if hypothesis.score > best_hypothesis.score - MIN_LOG_ODDS
     ]
@@ -187,7 +189,7 @@ def _decide(
     )
 
 
-def _describe(hypothesis: Hypothesis) -> str:
+def _describe_hypothesis(hypothesis: Hypothesis) -> str:
     rotation = (
         f", rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°"
         if hypothesis.has_rotation
@@ -229,7 +231,9 @@ def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> 
         best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
         best = replace(best_candidate, heading_from=best.heading_from)
         positions = positions.with_clock_drift(start_drift)
-    hypothesis = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
+    hypothesis = refine_hypothesis(
+        replace(best, has_clock_drift=True), positions, positions.motion(imu), imu
+    )
     clock_drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
     return clock_drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE, UNITS, without_drift
+from px4fuse.convention.axes import CLOCKWISE, UNITS, without_clock_drift
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
@@ -70,7 +70,7 @@ class Faults:
     is_ambiguous: bool = False
 
     @property
-    def of_positions(self) -> bool:
+    def has_position_fault(self) -> bool:
         """True if axes, rotation, unit or timestamps of the positions are wrong."""
         return bool(
             self.has_wrong_axes
@@ -126,7 +126,9 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         orientation=orientation_fault,
         is_north_unknown=has_wrong_axes and has_own_heading,
     )
-    return replace(faults, affects_ekf2=is_fused and (faults.of_positions or has_wrong_heading))
+    return replace(
+        faults, affects_ekf2=is_fused and (faults.has_position_fault or has_wrong_heading)
+    )
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
@@ -213,4 +215,4 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
-    return time_index(without_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)
+    return time_index(without_clock_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)

@@ -141,7 +141,9 @@ def read_inertial(flight: Flight) -> Inertial | None:
     integral_steps = np.diff([np.interp(time_s, imu_s, column) for column in imu_integral.T]).T
     force_m_s2 = integral_steps[:, :3] / STEP_S
     logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    gyro_attitude = _level(_integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2)
+    gyro_attitude = _level_attitude(
+        _integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2
+    )
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
@@ -181,7 +183,7 @@ def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
     )
 
 
-def _level(attitude: Array, force_m_s2: Array) -> Array:
+def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
     mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):

@@ -198,7 +198,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
         flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
         is_grid_enabled = np.asarray(step_values_at(aid_log.enabled, flight_grid_s) > 0.0)
-        enabled_fraction = _fraction(is_grid_enabled, np.ones(len(flight_grid_s), bool))
+        enabled_fraction = _fraction_within(is_grid_enabled, np.ones(len(flight_grid_s), bool))
     fused_logged = "fused" in samples
     is_fused: BoolArray
     is_rejected: BoolArray
@@ -248,16 +248,16 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         unit=aid.unit,
         topic=aid_log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction(is_fused & is_enabled, is_enabled),
+        fused_fraction=_fraction_within(is_fused & is_enabled, is_enabled),
         fused_logged=fused_logged,
-        rejected_fraction=_fraction(is_rejected & is_enabled, is_enabled),
+        rejected_fraction=_fraction_within(is_rejected & is_enabled, is_enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, aid_log, noise_median),
         axes=axes,
-        verdict=_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
+        verdict=_aid_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
         if is_evaluated.any()
         else "disabled",
     )
@@ -289,7 +289,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     return largest_change
 
 
-def _fraction(is_selected: BoolArray, is_in_set: BoolArray) -> float:
+def _fraction_within(is_selected: BoolArray, is_in_set: BoolArray) -> float:
     return float(is_selected.sum() / max(is_in_set.sum(), 1))
 
 
@@ -337,7 +337,7 @@ def _longest_gap(
     return float(gap_ends_s[longest_index]), float(gap_ends_s[longest_index + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
+def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
         NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s

@@ -262,7 +262,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
     sample_index = np.maximum(intervals[0].events.sample, 0)
-    measured_values, measurement_variance = _measurements(
+    measured_values, measurement_variance = _measurements_by_event(
         inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
     )
     is_sequential = inputs.aid == GNSS_POS
@@ -445,7 +445,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
         if inputs.rules.min_bias_variance is not None:
-            _limit_bias(P, inputs.rules.min_bias_variance, has_biases)
+            _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
@@ -742,7 +742,7 @@ def _variance_growth(
     )
 
 
-def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
+def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
     """Estimate the correlations of the initial state of a segment; the log has variances only.
 
     Without correlations, the first updates would divide the error differently than EKF2 between
@@ -826,7 +826,7 @@ def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
     return noise_variance
 
 
-def _limit_bias(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
+def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
@@ -837,7 +837,7 @@ def _limit_bias(P: Array, absolute_minimum: float, has_biases: BoolArray) -> Non
     ]
 
 
-def _measurements(
+def _measurements_by_event(
     inputs: Inputs,
     segment: ReplaySegment,
     sample_index: IntArray,

@@ -250,7 +250,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
             f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
-    if missing_imu := _missing_imu(imu.index.to_numpy()):
+    if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
     position_samples = (
         read_gnss(flight, ekf2, fusion_record)
@@ -344,7 +344,7 @@ def lost_imu_fraction(time_s: Array) -> float:
     return float(lost_count / (lost_count + len(time_s)))
 
 
-def _missing_imu(time_s: Array) -> Unavailable | None:
+def _explain_missing_imu(time_s: Array) -> Unavailable | None:
     median_interval_s = float(np.median(np.diff(time_s)))
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -552,7 +552,7 @@ def _logged_decisions(
     if (
         isinstance(innovations, Unavailable)
         or isinstance(horizon_s, Unavailable)
-        or aid_source(aid) not in ekf2.innovation_topics
+        or innovation_topic(aid) not in ekf2.innovation_topics
     ):
         return rejected_flags, is_reset
     delay_s = effective_settings(fusion_record.parameters, aid)[aid.delay] * 1e-3
@@ -570,7 +570,7 @@ def _logged_decisions(
     for begin, end in span_rows.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_reset = np.isnan(rejected_flags)
-    sample_row = same_sample(innovations.index.to_numpy(), measured_s)
+    sample_row = matching_sample_rows(innovations.index.to_numpy(), measured_s)
     sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
@@ -609,12 +609,12 @@ def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     return spans_s
 
 
-def aid_source(aid: Aid) -> str:
+def innovation_topic(aid: Aid) -> str:
     """Return the uORB topic with the innovations of an aiding source."""
     return f"estimator_aid_src_{aid.name}"
 
 
-def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
+def matching_sample_rows(sample_s: Array, measurement_s: Array) -> IntArray:
     """Return the index of the sample at each measurement time; -1 without a sample."""
     sample_row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
     sample_row = np.minimum(sample_row, len(sample_s) - 1)

@@ -26,10 +26,10 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
     run_segment,
-    with_correlation,
+    with_state_correlation,
 )
 from px4fuse.ekf2.heights import MIN_GATE
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, prepare_inputs
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
@@ -135,7 +135,7 @@ def _open_without_aids(
     baseline_configuration = FilterConfiguration(inputs.settings)
     timing = baseline_configuration.timing(inputs)
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
-    segments = tuple(with_correlation(inputs, segment) for segment in inputs.segments)
+    segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
     for configuration in request_configurations(inputs):
@@ -231,7 +231,7 @@ def replay_settings(
         return ()
     uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
-        excluded_rows = same_sample(inputs.received.stamp_s, excluded_s)
+        excluded_rows = matching_sample_rows(inputs.received.stamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
         rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
         no_reset = np.zeros(len(rejected_flags), dtype=bool)
@@ -257,7 +257,7 @@ def replay_settings(
         updates = replay.updates
         if excluded_s is not None:
             age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
-            excluded_rows = same_sample(updates.index.to_numpy(), excluded_s - age_s)
+            excluded_rows = matching_sample_rows(updates.index.to_numpy(), excluded_s - age_s)
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
             ]

@@ -22,7 +22,7 @@ from px4fuse.core.record import (
     Span,
 )
 from px4fuse.core.text import count_noun
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, aid_source, replayed_aid, same_sample
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, innovation_topic, matching_sample_rows, replayed_aid
 from px4fuse.ekf2.replay_segments import SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
@@ -255,7 +255,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "Record vehicle_local_position during the whole flight.",
         )
     aid = replayed_aid(ekf2)
-    is_own_topic = aid_source(aid) in ekf2.innovation_topics
+    is_own_topic = innovation_topic(aid) in ekf2.innovation_topics
     position_agreement = _compare_innovations(
         ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
     )
@@ -277,7 +277,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            f"positions differ by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            f"positions differ by {_format_above(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
@@ -407,7 +407,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             matched_updates,
             logged_aid_innovations(name, aid_log),
             axes_of(updates),
-            aid_source(AIDS[name]) in aid_log.topics,
+            innovation_topic(AIDS[name]) in aid_log.topics,
         )
         if isinstance(compared, str):
             omitted_aids[name] = compared
@@ -461,7 +461,7 @@ def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool)
     ``is_own_topic`` is True for estimator_aid_src topics, which contain measurement times.
     """
     if is_own_topic:
-        return same_sample(updates.index.to_numpy(), logged_s)
+        return matching_sample_rows(updates.index.to_numpy(), logged_s)
     fused_at = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at[np.maximum(update_row, 0)]
@@ -564,7 +564,7 @@ def _agreement_verdict(
         if difference_m > limit_m:
             return False, (
                 "the innovations agree, but replayed and published positions differ by "
-                f"{_format_beyond(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
+                f"{_format_above(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
         return True, f"{correlation_text}"
@@ -589,7 +589,7 @@ def _agreement_verdict(
     )
 
 
-def _format_beyond(value: float, limit: float) -> str:
+def _format_above(value: float, limit: float) -> str:
     """Format a value with at least two decimals, so that it is visibly above the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 

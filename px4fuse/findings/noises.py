@@ -18,7 +18,7 @@ from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
-    can_improve,
+    can_show_improvement,
     find_cause,
     find_trial,
     find_trials,
@@ -188,7 +188,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     if trial := find_trial(analysis.main_trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
-        trial.filter == "kf" and trial.change.keys() == {name} and can_improve(trial)
+        trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
         for trial in analysis.main_trials
     ):
         return NO_IMPROVEMENT
