@@ -30,7 +30,7 @@ from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
 # Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
-SMALLEST_SIGMA_Z_M = 0.005
+MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of each change of KF (:attr:`Trial.kinds`)
 KF_KINDS = {
@@ -46,9 +46,9 @@ SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
 # SIGMA_A also covers tilt error and bias
-VIBRATION_FACTOR = 3.0
+MIN_VIBRATION_RATIO = 3.0
 # EKF2 parameters that a re-run sets to PX4's default if the log has another value
-PARAMETERS_OF_EKF2 = (
+RESTORED_PARAMETERS = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
     "EKF2_ACC_B_NOISE",
@@ -57,7 +57,7 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.gate,
 )
 # Minimum yaw misalignment, in σ of its estimate, that a re-run corrects
-HEADING_SIGMAS = 3.0
+MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
 def candidate_changes(
@@ -94,7 +94,7 @@ def candidate_changes(
     if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
-        is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
+        is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if inputs is None:
         return changes + _bias_changes(estimates)
@@ -193,7 +193,7 @@ def _kf_noise_changes(
         ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
         noise_bound = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
-            ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
+            ml_sigma = max(ml_sigma, MIN_RERUN_SIGMA_Z_M)
         if (
             ml_sigma
             and noise_bound is not None
@@ -228,7 +228,7 @@ def _ekf2_noise_changes(
 def _px4_default_changes(log: LogInfo, inputs: Inputs) -> list[Change]:
     """Return PX4's default of each changed noise, and of a gate below PX4's default."""
     gate, logged_parameters = inputs.aid.gate, inputs.settings
-    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
+    defaults = {name: log.default_of(name) for name in (gate, *RESTORED_PARAMETERS)}
     return [
         {name: value}
         for name, value in defaults.items()
@@ -250,7 +250,7 @@ def _vibration_noise_changes(
     logged_noise, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
-    ) * steps_per_dt**0.5 <= VIBRATION_FACTOR * logged_noise:
+    ) * steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_noise:
         return []
     ml_noise = min((axis_tuning.sigma_a_two_state.value or 0.0) * steps_per_dt**0.5, px4_maximum)
     return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > logged_noise else []

@@ -41,11 +41,11 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Minimum ratio of measured to nominal IMU rate: measured rates are up to 2 % lower
-CLOCK_RATE_MARGIN = 0.98
+MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # Minimum number of time offset estimates on each side of a tested change in flight
-MIN_PARTS = 2
+MIN_PARTS_PER_SIDE = 2
 
 # Axes with a noise estimate in the report; north and east share one estimate
 REPORTED_AXES = (HORIZONTAL, "down")
@@ -290,7 +290,7 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
     needed_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_CLOCK_IMU_HZ
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
-    if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
+    if rate_hz >= MIN_IMU_RATE_RATIO * needed_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
@@ -314,7 +314,7 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
-    if len(offsets_s) <= MIN_PARTS:
+    if len(offsets_s) <= MIN_PARTS_PER_SIDE:
         return structs.replace(
             clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
@@ -354,7 +354,7 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     Changes below ``MIN_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
-    split_rows = range(MIN_PARTS, part_count - MIN_PARTS + 1)
+    split_rows = range(MIN_PARTS_PER_SIDE, part_count - MIN_PARTS_PER_SIDE + 1)
     smallest_p = 1.0
     for split_row in split_rows:
         before_and_after = [

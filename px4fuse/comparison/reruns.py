@@ -77,7 +77,7 @@ NO_DIFFERENCE = Unavailable(
 )
 # Maximum ratio of RMSE or σ ratio between log and EKF2 replay, for a comparison of re-runs with the
 # log instead of the replay
-MAX_REPLAY_FACTOR = 1.10
+MAX_REPLAY_LOG_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -276,9 +276,13 @@ def _unchanged_statistics(
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     logged_and_replayed = (
-        (logged_statistics.position_rmse_m, replayed_statistics.position_rmse_m, MAX_REPLAY_FACTOR),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_FACTOR**2),
-        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_FACTOR**2),
+        (
+            logged_statistics.position_rmse_m,
+            replayed_statistics.position_rmse_m,
+            MAX_REPLAY_LOG_RATIO,
+        ),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_LOG_RATIO**2),
+        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_LOG_RATIO**2),
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor

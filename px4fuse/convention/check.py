@@ -7,7 +7,7 @@ from msgspec import structs
 
 from px4fuse.convention.axes import (
     MAX_OFFSET_S,
-    SMALL_ROTATION,
+    SMALL_ROTATION_RAD,
     UNITS,
     Hypothesis,
     SentPositions,
@@ -37,9 +37,9 @@ from px4fuse.trajectory.rotation import heading
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
 # Minimum log-likelihood gain of a convention over positions unrelated to the motion
-MIN_GAIN = 8.0
+MIN_LIKELIHOOD_GAIN = 8.0
 # Minimum log-likelihood gain per independent sample: unambiguous, ambiguous convention
-MIN_GAIN_PER_WINDOW = (0.15, 0.4)
+MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Range of the scale of a convention (source's distances ÷ IMU's distances) that is not doubtful
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
 # Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
@@ -52,15 +52,15 @@ MAX_LOGGED_DEFICIT = 20.0
 # Minimum log-likelihood gain by a clock drift that is corrected
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
-DRIFTS = np.linspace(-0.05, 0.05, 21)
+TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # Maximum fraction of repeated positions that are ignored
 MAX_REPEATED_FRACTION = 0.5
 # Minimum fraction of positions with a height for the use of heights
 MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
-THIRD_DIFFERENCE = 20.0
+THIRD_DIFFERENCE_VARIANCE = 20.0
 # Variance of second differences of white noise with variance 1
-SECOND_DIFFERENCE = 6.0
+SECOND_DIFFERENCE_VARIANCE = 6.0
 
 
 def check_convention(
@@ -130,7 +130,7 @@ def _search_hypotheses(
         if (
             hypothesis.heading_from == "EKF2"
             and hypothesis.score > hypotheses[0].score - MAX_LOGGED_DEFICIT
-            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION)
+            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
             return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
@@ -154,11 +154,11 @@ def _choose_convention(
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
     verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
-    if best_hypothesis.score < MIN_GAIN:
+    if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
         best_hypothesis.score
-        < MIN_GAIN_PER_WINDOW[is_ambiguous] * best_hypothesis.independent_count
+        < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_count
         or best_hypothesis.scale > MAX_SCALE
         or best_hypothesis.max_scale < MIN_SCALE
         or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
@@ -210,7 +210,9 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
     noise_m = (
-        UNITS[hypothesis.unit] * residual_deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+        UNITS[hypothesis.unit]
+        * residual_deviation
+        * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
     return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
@@ -218,10 +220,10 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
 def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
     start_drift = 0.0
-    if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
+    if best.score < MIN_LIKELIHOOD_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
             (candidates[0], clock_drift)
-            for clock_drift in DRIFTS.tolist()
+            for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
                 candidates := find_candidates(
                     positions.with_clock_drift(clock_drift).motion(imu), imu

@@ -30,7 +30,7 @@ MIN_REMAINDER_DEG = 8.0
 # error
 MIN_ROTATION_DEG = 15.0
 # Minimum delay (s) that is corrected with the convention; a smaller one is a time offset
-MIN_LATE_S = 0.5
+MIN_CORRECTED_DELAY_S = 0.5
 # Minimum heading difference (°) between a wrong orientation and the motion of its source
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
@@ -121,7 +121,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         has_wrong_axes=has_wrong_axes,
         rotation_deg=rotation_deg,
         has_wrong_unit=convention.unit != "m",
-        late_s=convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0,
+        late_s=convention.late_s if abs(convention.late_s) >= MIN_CORRECTED_DELAY_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=orientation_fault,
         is_north_unknown=has_wrong_axes and has_own_heading,

@@ -32,7 +32,7 @@ MIN_BIAS_RATIO = 0.5
 # Minimum |mean innovation| (√S) of a biased aiding source
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
-WINDOW_S = 10.0
+CHANGE_WINDOW_S = 10.0
 # Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
 # Minimum number of windows before a change of the mean normalised innovation
@@ -43,9 +43,9 @@ MIN_CHANGE_IN_SIGMA = 0.5
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
-NOT_FUSED_LIMIT_S = 5.0
+MAX_NOT_FUSED_S = 5.0
 # Maximum number of logging intervals without a fused sample of an enabled aiding source
-NOT_FUSED_INTERVALS = 10.0
+MAX_NOT_FUSED_INTERVALS = 10.0
 # Maximum relative difference between √R and the noise parameter from which R is computed
 NOISE_TOLERANCE = 0.02
 # Minimum height (m) above ground for statistics of aiding sources, because rotor downwash
@@ -269,7 +269,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     For each window, the mean of the two windows after it is compared with the mean before it. The
     change begins in the window itself if its own mean has changed by a third of that.
     """
-    window_index = np.floor((time_s - time_s[0]) / WINDOW_S)
+    window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
     window_means = windows["mean"].to_numpy()
@@ -284,7 +284,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
         if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
             has_begun = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
             first_window = windows.index[index if has_begun else index + 1]
-            largest_change = float(time_s[0] + WINDOW_S * first_window), mean_change
+            largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_window), mean_change
             min_change = abs(mean_change)
     return largest_change
 
@@ -340,7 +340,7 @@ def _longest_gap(
 def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
-        NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s
+        MAX_NOT_FUSED_S, MAX_NOT_FUSED_INTERVALS * interval_s
     ):
         return "not_fused"
     if not axes:

@@ -79,10 +79,10 @@ MIN_BIAS_VARIANCE_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
 BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
-MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
+JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
-HORIZONTAL = slice(NORTH, EAST + 1)
+HORIZONTAL_POSITION = slice(NORTH, EAST + 1)
 # State indices of velocity and position, which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
 # Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
@@ -531,7 +531,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 x,
                 P,
                 is_reset[e],
-                HORIZONTAL,
+                HORIZONTAL_POSITION,
                 measured_values[e, :, POSITION_COLUMNS],
                 reset_variance,
             )
@@ -589,9 +589,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
 def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
-    HP = np.take(P, MEASURED, axis=1)
-    HPH = np.take(HP, MEASURED, axis=2)
-    HPH.reshape(len(x), -1)[:, :: len(MEASURED) + 1] += R
+    HP = np.take(P, JOINTLY_MEASURED_STATES, axis=1)
+    HPH = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
+    HPH.reshape(len(x), -1)[:, :: len(JOINTLY_MEASURED_STATES) + 1] += R
     K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP

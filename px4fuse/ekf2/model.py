@@ -33,7 +33,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    MAX_COMPARED_REJECTIONS,
+    MAX_COMPARED_REJECTED_FRACTION,
     UPDATE_COLUMNS,
     VELOCITY_UPDATE_COLUMNS,
     Agreement,
@@ -148,7 +148,10 @@ def _open_without_aids(
         return agreement
     model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MAX_COMPARED_REJECTIONS and np.isfinite(inputs.received.rejected).any():
+    if (
+        rejected_share > MAX_COMPARED_REJECTED_FRACTION
+        and np.isfinite(inputs.received.rejected).any()
+    ):
         with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(with_decisions, Agreement):
             agreement = with_logged_rejections(agreement, with_decisions)

@@ -63,7 +63,7 @@ VELOCITY_UPDATE_COLUMNS = [
     "velocity_rejected",
 ]
 # Minimum number of logged innovations for a comparison with the EKF2 replay
-MIN_SAMPLES = 20
+MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
@@ -71,7 +71,7 @@ MAX_INNOVATION_AGE_S = 0.5
 SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
-MIN_CORRELATION = 0.95
+MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |S replayed / S logged - 1| (median): below 0.003 with complete logs, above 0.05 with a
 # downsampled source
 MAX_S_DIFFERENCE = 0.05
@@ -82,7 +82,7 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Maximum rejected fraction for a comparison of single innovations; with more rejections, one
 # sample near the gate changes many later innovations
-MAX_COMPARED_REJECTIONS = 0.05
+MAX_COMPARED_REJECTED_FRACTION = 0.05
 # Maximum rejected fraction for a comparison of the published position, which is otherwise mostly
 # integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
@@ -316,10 +316,10 @@ def _compare_innovations(
     # a sample to which EKF2 resets its state is logged with innovation 0
     is_used &= logged.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged, updates = logged[is_used], updates.iloc[matched_updates[is_used]]
-    if len(logged) < MIN_SAMPLES:
+    if len(logged) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
-            f"(at least {MIN_SAMPLES} are needed)"
+            f"(at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
@@ -558,7 +558,7 @@ def _agreement_verdict(
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
     )
-    if min_correlation >= MIN_CORRELATION:
+    if min_correlation >= MIN_INNOVATION_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
         limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > limit_m:
@@ -568,8 +568,8 @@ def _agreement_verdict(
                 "lacks an input of EKF2's output predictor"
             )
         return True, f"{correlation_text}"
-    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTIONS:
-        return False, f"{correlation_text}, below the minimum of {MIN_CORRELATION:g}"
+    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTED_FRACTION:
+        return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
     rejected_difference = abs(rejected_in_replay - rejected_in_log)
     nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()

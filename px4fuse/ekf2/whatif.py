@@ -70,7 +70,7 @@ MAX_SWEEP_VALUES = 200
 # Position noise (m) that is added in repeated replays
 ADDED_NOISE_M = 0.002
 # Number of repeated replays with added position noise
-ADDED_NOISE_RUNS = 4
+NOISY_REPLAY_COUNT = 4
 # Minimum rejected fraction of a replay that is repeated with added position noise
 MIN_REJECTED_FRACTION = 0.02
 # Maximum rejected fraction of a replay with predictable statistics
@@ -316,7 +316,7 @@ def _mark_unpredictable(
         and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
     uncertain_changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
-    for seed in range(ADDED_NOISE_RUNS if uncertain_changes else 0):
+    for seed in range(NOISY_REPLAY_COUNT if uncertain_changes else 0):
         noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
         replays = replay_settings(noisy_model, uncertain_changes, without=without)
         for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):

@@ -33,9 +33,9 @@ SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
 # Maximum number of L-BFGS-B iterations for the final noises
-MAX_ITERATIONS = 50
+MAX_FINAL_ITERATIONS = 50
 # Maximum number of L-BFGS-B iterations while the outlier probabilities still change
-COARSE_MAX_ITERATIONS = 3
+MAX_COARSE_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
 # Initial value of the fraction of outliers
@@ -319,7 +319,7 @@ def maximise_likelihood(
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
-            likelihood, noises, COARSE_MAX_ITERATIONS if iteration else MAX_ITERATIONS
+            likelihood, noises, MAX_COARSE_ITERATIONS if iteration else MAX_FINAL_ITERATIONS
         )
         expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
         # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
@@ -425,7 +425,7 @@ def outlier_variance_factor(
 
 
 def _maximise_by_gradient(
-    likelihood: Likelihood, start_noises: Noises, max_steps: int = MAX_ITERATIONS
+    likelihood: Likelihood, start_noises: Noises, max_steps: int = MAX_FINAL_ITERATIONS
 ) -> Noises:
     nonzero_noises = {name: value for name, value in vars(start_noises).items() if value}
     log_bounds = np.log([SEARCH_RANGES[name] for name in nonzero_noises])

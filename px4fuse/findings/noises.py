@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
+from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -192,7 +192,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
         for trial in analysis.main_trials
     ):
         return NO_IMPROVEMENT
-    value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
+    value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
     return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
