@@ -133,7 +133,7 @@ class Attempt:
 
 
 def find_unmet(attempt: Attempt) -> UnmetCondition:
-    """Return the first condition that is not met, in EKF2's order; UNKNOWN_CONDITION if all are met."""
+    """Return the first condition of EKF2 that is not met; UNKNOWN_CONDITION if all are met."""
     conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
     return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN_CONDITION)
 
