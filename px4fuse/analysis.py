@@ -47,7 +47,7 @@ class Analysis(Comparison, Estimates, Reruns):
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
         """Replay of EKF2 with the parameters as flown, and its agreement with the log."""
         model = self.ekf2_model
-        return model if isinstance(model, Unavailable) else model.flown
+        return model if isinstance(model, Unavailable) else model.baseline_replay
 
     @property
     def main_trials(self) -> list[Trial]:

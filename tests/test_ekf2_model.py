@@ -84,7 +84,7 @@ def test_ekf2_model_states_between_updates_equal_predictions(model: Model, attit
 def test_ekf2_model_innovations_equal_those_of_simple_filter(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
-    updates = model.flown.updates.iloc[: len(nu)]
+    updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100
     for at, axis in enumerate(HORIZONTAL):
         np.testing.assert_allclose(updates[f"innovation_{axis}_m"], nu[:, at], rtol=0, atol=5e-4)
@@ -119,12 +119,14 @@ def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> N
             joint, separate = getattr(found, part), getattr(alone, part)
             pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
         assert dict(found.changed) == change
-    pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
+    pd.testing.assert_frame_equal(
+        together[3].published, model.baseline_replay.published, rtol=0.0, atol=1e-9
+    )
 
 
 def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     vision = model.inputs.received
-    assert (model.flown.late, model.flown.lost) == (0, 0)
+    assert (model.baseline_replay.late, model.baseline_replay.lost) == (0, 0)
     # the horizon is 214 ms, and samples may be 100 ms later
 
     def arriving(after_s: float, **settings: float) -> Any:
@@ -188,8 +190,8 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Model, sample_flight: 
     fused = replace(
         sample_flight, ekf2=replace(ekf2, fusion_flags=ekf2.fusion_flags.assign(vertical=1.0))
     )
-    low = opened(with_vision(fused, samples)).flown.delayed["down_m"].loc[40.0:100.0]
-    own = model.flown.delayed["down_m"].loc[40.0:100.0]
+    low = opened(with_vision(fused, samples)).baseline_replay.delayed["down_m"].loc[40.0:100.0]
+    own = model.baseline_replay.delayed["down_m"].loc[40.0:100.0]
     vision = samples["down_m"].loc[40.0:100.0]
     assert low.mean() == pytest.approx(vision.mean(), abs=0.03)
     assert abs(own.mean() - vision.mean()) > 0.4
@@ -201,5 +203,5 @@ def test_ekf2_model_with_constant_accelerometer_bias_is_finite(sample_flight: Fl
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
     parameters = {**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
     made = opened(with_record(sample_flight, delayed=fixed, parameters=parameters))
-    assert np.isfinite(made.flown.published.to_numpy()).all()
-    assert np.isfinite(made.flown.updates.to_numpy()).all()
+    assert np.isfinite(made.baseline_replay.published.to_numpy()).all()
+    assert np.isfinite(made.baseline_replay.updates.to_numpy()).all()

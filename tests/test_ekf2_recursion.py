@@ -18,21 +18,21 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
     _Fusion,
-    _limit_bias,
+    _limit_bias_variance,
     _sequential_update,
     _settled_state_correlation,
     run_segment,
 )
-from px4fuse.ekf2.filter_recursion import _measurements as measurements
+from px4fuse.ekf2.filter_recursion import _measurements_by_event as measurements
 from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import (
     FUSE,
     IDLE,
     START,
     Timing,
-    _actions,
-    _events,
-    _noises,
+    _imu_noise_by_interval,
+    _make_events,
+    _sample_actions,
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_settings
@@ -46,12 +46,12 @@ def test_accelerometer_bias_variance_obeys_px4_limits():
     P = np.zeros((2, 15, 15))
     for each in P:
         np.fill_diagonal(each[12:, 12:], [4.0, 1e-3, 0.1])
-    _limit_bias(P, 5e-4, np.array([True, False]))
+    _limit_bias_variance(P, 5e-4, np.array([True, False]))
     # at most 0.1 g, ratio between the axes at most 100
     np.testing.assert_allclose(np.diag(P[0])[12:], [0.980665**2, 0.04, 0.1])
     np.testing.assert_allclose(np.diag(P[1])[12:], [4.0, 1e-3, 0.1])
     np.fill_diagonal(P[0][12:, 12:], [1e-3, 1e-5, 1e-3])
-    _limit_bias(P, 5e-4, np.array([True, False]))
+    _limit_bias_variance(P, 5e-4, np.array([True, False]))
     np.testing.assert_allclose(np.diag(P[0])[12:], [1e-3, 5e-4, 1e-3])
 
 
@@ -411,7 +411,9 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
-    closed_forms = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
+    closed_forms = _imu_noise_by_interval(
+        np.array([float(n)]), np.array([n * dt]), (n * tilt)[None]
+    )
     # for the gyro, only leading terms of position with velocity and itself
     sums[0][6:9, 3:9] = closed_forms[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
     sums[0][3:6, 6:9] = sums[0][6:9, 3:6].T
@@ -435,7 +437,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(Inputs, rules=rules)
-    action, _ = _actions(inputs, segment, taken, end, np.ones(len(taken), bool))
+    action, _ = _sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
 
@@ -456,7 +458,7 @@ def events(
     inputs = made(
         Inputs, received=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
     )
-    return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
+    return _make_events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
 def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():

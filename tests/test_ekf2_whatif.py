@@ -250,7 +250,9 @@ def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake
 
 def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     changed = {"EKF2_EV_DELAY": 300.0}
-    never = replace(model.flown, updates=model.flown.updates[:0], lost=9, changed=changed)
+    never = replace(
+        model.baseline_replay, updates=model.baseline_replay.updates[:0], lost=9, changed=changed
+    )
     monkeypatch.setattr(whatif, "replay_settings", lambda *_, **_more: [never])
     with pytest.raises(SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"):
         what_if(model, [changed])

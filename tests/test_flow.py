@@ -146,7 +146,8 @@ def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
     for carried in (flying(), model()):
         (replay,) = replay_settings(carried, [{}], without=lost)
         difference = (
-            replay.delayed[["north_m", "east_m"]] - model().flown.delayed[["north_m", "east_m"]]
+            replay.delayed[["north_m", "east_m"]]
+            - model().baseline_replay.delayed[["north_m", "east_m"]]
         )
         off.append(float(np.hypot(*difference.loc[100.0:101.0].to_numpy().T).max()))
     assert off[0] < 1.5
@@ -227,7 +228,7 @@ def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, m
     if "outage" in name:
         assert agreement.carried_difference_m < 0.5
         assert agreement.doubtful == {}
-        ((lost_s, back_s),) = found.flown.flow_only_spans_s
+        ((lost_s, back_s),) = found.baseline_replay.flow_only_spans_s
         assert lost_s == pytest.approx(42.1, abs=0.2)  # 35.2 s after take-off
         assert back_s == pytest.approx(72.6, abs=1.0)
     else:

@@ -475,8 +475,11 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
         assert {segment.field is None for segment in model.inputs.segments} == {False}
         assert model.agreement.heading_rms_difference_deg < 0.5
         # height follows the logged EKF2 height
-        state, replayed = model.flight.ekf2.state["down_m"], model.flown.published["down_m"]
-        state = state[inside_spans(state.index, model.flown.evaluated_s)]
+        state, replayed = (
+            model.flight.ekf2.state["down_m"],
+            model.baseline_replay.published["down_m"],
+        )
+        state = state[inside_spans(state.index, model.baseline_replay.evaluated_s)]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
     assert heading_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of delay error rotate the heading in proportion to 4.7° for 200 ms

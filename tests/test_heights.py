@@ -257,9 +257,11 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     assert "a correlation of" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
     assert "barometer" in format_agreement(agreement)
-    assert model.flown.other_aid_updates == {}
-    own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
-    assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
+    assert model.baseline_replay.other_aid_updates == {}
+    own = np.interp(
+        model.baseline_replay.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"]
+    )
+    assert np.abs(model.baseline_replay.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
     assert HEIGHT_LOGGED_NOTE in found.notes
     with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE has no effect .*barometer: "):

@@ -88,7 +88,11 @@ def drawn(analysis: Analysis) -> list:
 def test_report_without_agreeing_replay_has_no_difference_page(sample: Analysis) -> None:
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
-    doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
+    doubtful = replace(
+        model,
+        agreement=agreement,
+        baseline_replay=replace(model.baseline_replay, agreement=agreement),
+    )
     explanation = explain_ekf2_difference(sample, doubtful, sample.clock, {})
     parted = replace(sample, ekf2_model=doubtful, difference_steps=explanation)
     absent = Unavailable("EKF2 replay", "no IMU", "Record it.")

@@ -30,7 +30,7 @@ from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
 # Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
-SMALLEST_SIGMA_Z_M = 0.005
+MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of each change of KF (:attr:`Trial.kinds`)
 KF_KINDS = {
@@ -46,9 +46,9 @@ SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
 # SIGMA_A also covers tilt error and bias
-VIBRATION_FACTOR = 3.0
+MIN_VIBRATION_RATIO = 3.0
 # EKF2 parameters that a re-run sets to PX4's default if the log has another value
-PARAMETERS_OF_EKF2 = (
+RESTORED_PARAMETERS = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
     "EKF2_ACC_B_NOISE",
@@ -57,47 +57,50 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.gate,
 )
 # Minimum yaw misalignment, in σ of its estimate, that a re-run corrects
-HEADING_SIGMAS = 3.0
+MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
 def candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
     inputs: Inputs | None,
-    result: AxisComparison,
+    axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
     """Return the changes that may explain a mean NIS or NEES (``statistic``) outside its limits."""
-    summary, origin = result.filters["kf" if inputs is None else "ekf2"], comparison.source.origin
+    summary, origin = (
+        axis_result.filters["kf" if inputs is None else "ekf2"],
+        comparison.source.origin,
+    )
     assert isinstance(summary, FilterSummary)  # only a tested filter has a discrepancy
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
-    axis_tuning = tuning_of_axis(estimates.tuning, result.axis.name)
+    axis_tuning = tuning_of_axis(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
     # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
     # smaller noise
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
         changes += (
-            _kf_noises(comparison.settings, axis_tuning, is_underconfident)
+            _kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
             if inputs is None
-            else _ekf2_noise(inputs, summary, axis_tuning)
+            else _ekf2_noise_changes(inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
         {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
     )
-    changes += [delay_parameters] if delay_parameters else _time_offset(estimates, inputs)
-    if result.axis.name == "down":
+    changes += [delay_parameters] if delay_parameters else _time_offset_changes(estimates, inputs)
+    if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
-        is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
+        is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if inputs is None:
-        return changes + _without_bias(estimates)
-    changes += _px4_defaults(comparison.flight.log, inputs)
+        return changes + _bias_changes(estimates)
+    changes += _px4_default_changes(comparison.flight.log, inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _vibration_noise(comparison.settings, inputs, axis_tuning)
+        changes += _vibration_noise_changes(comparison.settings, inputs, axis_tuning)
     return changes
 
 
@@ -116,7 +119,7 @@ def main_axis_changes(
     )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
-        offset_changes = _time_offset(estimates, inputs) if has_delay else []
+        offset_changes = _time_offset_changes(estimates, inputs) if has_delay else []
         return unique_changes([*changes, *offset_changes])
     noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noise_changes) > 1:
@@ -137,19 +140,21 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
     if inputs is not None:
         aid = inputs.aid
         kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
-    names = [name for name in change if name not in ACCOMPANYING_CHANGES]
+    changed_names = [name for name in change if name not in ACCOMPANYING_CHANGES]
     return tuple(
-        dict.fromkeys(KF_KINDS.get(name) or kinds.get(name, "process noise") for name in names)
+        dict.fromkeys(
+            KF_KINDS.get(name) or kinds.get(name, "process noise") for name in changed_names
+        )
     )
 
 
 def default_settings(comparison: Comparison) -> Change:
     """Return KF's default noises in place of the values that the user chose."""
     chosen_settings, px4fuse_default = comparison.settings, Settings()
-    names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
+    setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
         name: getattr(px4fuse_default, name)
-        for name in names
+        for name in setting_names
         if getattr(chosen_settings, name) != getattr(px4fuse_default, name)
     }
 
@@ -159,24 +164,26 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
+def _time_offset_changes(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset if a significant part of it is not yet applied.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
     """
-    clock = estimates.clock
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    clock_offset = estimates.clock
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return []
-    if not clock.is_significant(clock.remaining_s if inputs is None else clock.offset_s):
+    if not clock_offset.is_significant(
+        clock_offset.remaining_s if inputs is None else clock_offset.offset_s
+    ):
         return []
-    change = {CLOCK_OFFSET: round(clock.offset_s, 3)}
+    change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
     if inputs is not None:
-        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock.offset_s
+        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock_offset.offset_s
         change |= horizon_change(inputs.settings, age_ms)
     return [change]
 
 
-def _kf_noises(
+def _kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
     """Return the noise estimates that differ significantly from the settings."""
@@ -186,7 +193,7 @@ def _kf_noises(
         ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
         noise_bound = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
-            ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
+            ml_sigma = max(ml_sigma, MIN_RERUN_SIGMA_Z_M)
         if (
             ml_sigma
             and noise_bound is not None
@@ -196,7 +203,7 @@ def _kf_noises(
     return changes
 
 
-def _without_bias(estimates: Estimates) -> list[Change]:
+def _bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
         return []
@@ -207,7 +214,9 @@ def _without_bias(estimates: Estimates) -> list[Change]:
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
 
-def _ekf2_noise(inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning) -> list[Change]:
+def _ekf2_noise_changes(
+    inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
+) -> list[Change]:
     """Return EKF2 parameters for the estimated position noise, if it differs significantly."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
@@ -216,10 +225,10 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning)
     return [change] if change else []
 
 
-def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
+def _px4_default_changes(log: LogInfo, inputs: Inputs) -> list[Change]:
     """Return PX4's default of each changed noise, and of a gate below PX4's default."""
     gate, logged_parameters = inputs.aid.gate, inputs.settings
-    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
+    defaults = {name: log.default_of(name) for name in (gate, *RESTORED_PARAMETERS)}
     return [
         {name: value}
         for name, value in defaults.items()
@@ -229,7 +238,9 @@ def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
     ]
 
 
-def _vibration_noise(settings: Settings, inputs: Inputs, axis_tuning: AxisTuning) -> list[Change]:
+def _vibration_noise_changes(
+    settings: Settings, inputs: Inputs, axis_tuning: AxisTuning
+) -> list[Change]:
     """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
@@ -239,7 +250,7 @@ def _vibration_noise(settings: Settings, inputs: Inputs, axis_tuning: AxisTuning
     logged_noise, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
-    ) * steps_per_dt**0.5 <= VIBRATION_FACTOR * logged_noise:
+    ) * steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_noise:
         return []
     ml_noise = min((axis_tuning.sigma_a_two_state.value or 0.0) * steps_per_dt**0.5, px4_maximum)
     return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > logged_noise else []

@@ -266,37 +266,37 @@ def _mean_nees(normalised_errors: Array) -> float | None:
     )
 
 
-def position_errors(result: AxisComparison, filter_name: FilterName) -> Frame:
+def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Frame:
     """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
     The index is the time (s) of EKF2's published state or, without EKF2, of KF's predictions. The
     columns are ``error_m`` and ``sigma_m``; NaN where unknown.
     """
-    if isinstance(result.truth, Unavailable):
-        return result.truth
+    if isinstance(axis_result.truth, Unavailable):
+        return axis_result.truth
     state: pd.DataFrame
     variance: Frame
     if filter_name == "kf":
-        state, variance = _kf_track(result.replay, result.ekf2_state)
-    elif isinstance(result.ekf2_state, Unavailable):
-        return result.ekf2_state
+        state, variance = _kf_track(axis_result.replay, axis_result.ekf2_state)
+    elif isinstance(axis_result.ekf2_state, Unavailable):
+        return axis_result.ekf2_state
     else:
-        state, variance = result.ekf2_state, result.ekf2_variance
+        state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     time_s = state.index.to_numpy()
-    errors_m = _errors(state, result.truth, STATE_COLUMNS[0])
+    errors_m = _errors(state, axis_result.truth, STATE_COLUMNS[0])
     sigma_m = reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
     return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
 
 
 def normalised_position_errors(
-    result: AxisComparison, filter_name: FilterName
+    axis_result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
     """Return the times (s), and the position errors against ground truth ÷ reported σ."""
-    errors = position_errors(result, filter_name)
+    errors = position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
-    if filter_name == "ekf2" and isinstance(result.ekf2_variance, Unavailable):
-        return result.ekf2_variance
+    if filter_name == "ekf2" and isinstance(axis_result.ekf2_variance, Unavailable):
+        return axis_result.ekf2_variance
     normalised_errors = (errors["error_m"] / errors["sigma_m"]).dropna()
     if normalised_errors.empty:
         return Unavailable(

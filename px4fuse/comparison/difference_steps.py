@@ -48,7 +48,7 @@ MIN_UNREPLAYED_RATIO = 3.0
 def explain_ekf2_difference(
     comparison: Comparison,
     model: Model | Unavailable,
-    clock: ClockOffset | Unavailable,
+    clock_offset: ClockOffset | Unavailable,
     estimated_noises: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
@@ -57,14 +57,16 @@ def explain_ekf2_difference(
     (:func:`corrected_settings`). If only the down axis was analysed, the result is the reason why
     it is not explained.
     """
-    axis_results = {name: result for name, result in comparison.axes.items() if name != "down"}
+    axis_results = {
+        name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
+    }
     if not axis_results:
         reason = "EKF2 can be replayed for horizontal positions only"
         action = "Analyse a horizontal axis, too (for example --axis north)."
         return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in axis_results}
-    kf_settings = _settings(comparison, model.inputs, estimated_noises)
+    kf_settings = _comparable_settings(comparison, model.inputs, estimated_noises)
     changed_settings = replace(comparison.settings, **estimated_noises)
     kf_runs = {
         name: replay(axis.axis, changed_settings, fast=True) if estimated_noises else axis.replay
@@ -73,7 +75,7 @@ def explain_ekf2_difference(
     explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(axis_results, explanations)
-    reasons = _step_reasons(replace(comparison, settings=changed_settings), model, clock)
+    reasons = _step_reasons(replace(comparison, settings=changed_settings), model, clock_offset)
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, by_steps in explanations.items():
         explanation = structs.replace(
@@ -116,22 +118,26 @@ def explanation_configurations(
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
     return list(
-        steps.step_configurations(inputs, _settings(comparison, inputs, corrected)).values()
+        steps.step_configurations(
+            inputs, _comparable_settings(comparison, inputs, corrected)
+        ).values()
     )
 
 
-def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]) -> Settings:
+def _comparable_settings(
+    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]
+) -> Settings:
     settings = replace(comparison.settings, **corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
 def _unreplayed_part(
-    result: AxisComparison, kf_run: Replay, spans: Spans
+    axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
 ) -> UnreplayedDifference | None:
-    if not isinstance(result.ekf2_state, pd.DataFrame):
+    if not isinstance(axis_result.ekf2_state, pd.DataFrame):
         return None
-    unreplayed_state = result.ekf2_state[~inside_spans(result.ekf2_state.index, spans)]
+    unreplayed_state = axis_result.ekf2_state[~inside_spans(axis_result.ekf2_state.index, spans_s)]
     unreplayed_s = unreplayed_state.index.to_numpy()
     distance_m = np.abs(
         state_at(kf_run, unreplayed_s)[0] - unreplayed_state["position_m"].to_numpy()
@@ -222,25 +228,25 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
 
 
 def _step_reasons(
-    comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
+    comparison: Comparison, model: Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    settings, inputs, source = comparison.settings, model.inputs, comparison.source
+    kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
     ekf2_parameters, aid = inputs.settings, inputs.aid
     samples_text = (
-        f"KF predicts every {settings.dt_s:g} s from its first position; EKF2 predicts every "
+        f"KF predicts every {kf_settings.dt_s:g} s from its first position; EKF2 predicts every "
         f"{1e3 * inputs.step_s:.0f} ms"
     )
-    if settings.input == "zero":
+    if kf_settings.input == "zero":
         samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != inputs.received.source:
         samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
-    age_ms = 1e3 * (source.assumed_delay_s - settings.clock_offset_s)
+    age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {age_ms:.0f} ms"
     )
-    if isinstance(clock, ClockOffset) and clock.is_determinable:
-        ends_s = (clock.offset_s, *clock.interval_s[::-1])
+    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+        ends_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
         ml_delay_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s) for offset_s in ends_s
         )
@@ -248,19 +254,21 @@ def _step_reasons(
             f". The maximum-likelihood estimate of this delay is {ml_delay_ms:.0f} ms (95 % "
             f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
-    equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    trusted_input = "IMU" if equivalent_sigma_a < settings.sigma_a_m_s2 else "positions"
+    equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
+        inputs.step_s / kf_settings.dt_s
+    )
+    trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
         steps.SAMPLES: samples_text,
         steps.TIMESTAMPS: delay_text,
         steps.NOISE: (
             f"EKF2 uses a measurement noise of {noise_used_m(model.inputs):.2g} m ({aid.noise}), "
-            f"KF {settings.sigma_z_m:.2g} m"
+            f"KF {kf_settings.sigma_z_m:.2g} m"
         ),
         steps.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS: (
             f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
-            f"{equivalent_sigma_a:.2g} m/s²; KF uses {settings.sigma_a_m_s2:.2g} m/s². "
+            f"{equivalent_sigma_a:.2g} m/s²; KF uses {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {trusted_input} more weight than KF"
         ),
         steps.ATTITUDE: (

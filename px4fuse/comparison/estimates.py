@@ -41,11 +41,11 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Minimum ratio of measured to nominal IMU rate: measured rates are up to 2 % lower
-CLOCK_RATE_MARGIN = 0.98
+MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # Minimum number of time offset estimates on each side of a tested change in flight
-MIN_PARTS = 2
+MIN_PARTS_PER_SIDE = 2
 
 # Axes with a noise estimate in the report; north and east share one estimate
 REPORTED_AXES = (HORIZONTAL, "down")
@@ -104,13 +104,13 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     tuned_axes = (
         REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     )
-    tuning, clock = estimate_noises_and_clock(comparison, progress, tuned_axes)
-    fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
+    tuning, clock_offset = estimate_noises_and_clock(comparison, progress, tuned_axes)
+    fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock_offset)
     source, is_odometry = comparison.source, comparison.source.orientation is not None
     return Estimates(
         tuning=tuning,
-        clock=clock,
-        heading=estimate_frame_rotation(comparison, tuning, clock, progress),
+        clock=clock_offset,
+        heading=estimate_frame_rotation(comparison, tuning, clock_offset, progress),
         systematic_errors=fit,
         source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
@@ -167,7 +167,7 @@ def estimate_noises_and_clock(
     if slow_imu := missing_imu_rate(comparison.flight):
         return tuning, slow_imu
     settings, axis_tuning = comparison.settings, first_axis_tuning(tuning, HORIZONTAL, *tuning)
-    clock = estimate_time_offset(
+    clock_offset = estimate_time_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
@@ -177,14 +177,16 @@ def estimate_noises_and_clock(
         progress,
         signal_cache,
     )
-    drifts = comparison.source.origin.may_drift
-    return tuning, widen_for_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock
+    may_drift = comparison.source.origin.may_drift
+    if may_drift and isinstance(clock_offset, ClockOffset):
+        clock_offset = widen_for_drift(clock_offset)
+    return tuning, clock_offset
 
 
 def estimate_frame_rotation(
     comparison: Comparison,
     tuning: Tuning,
-    clock: ClockOffset | Unavailable,
+    clock_offset: ClockOffset | Unavailable,
     progress: Progress = ignore_progress,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
@@ -193,8 +195,8 @@ def estimate_frame_rotation(
     if axis_tuning is not None:
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
     offset_s = 0.0
-    if isinstance(clock, ClockOffset) and clock.is_determinable:
-        offset_s = clock.remaining_s
+    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+        offset_s = clock_offset.remaining_s
     return estimate_heading_error(
         comparison.flight,
         comparison.source,
@@ -206,7 +208,7 @@ def estimate_frame_rotation(
 
 
 def _fit_source_errors(
-    comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable
+    comparison: Comparison, tuning: Tuning, clock_offset: ClockOffset | Unavailable
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -218,8 +220,12 @@ def _fit_source_errors(
         return horizontal, horizontal, horizontal
     flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, horizontal
     offset_s = 0.0
-    if isinstance(clock, ClockOffset) and clock.is_determinable:
-        offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
+    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
+        offset_s = (
+            clock_offset.remaining_s
+            if abs(clock_offset.remaining_s) > clock_offset.three_sigma_s
+            else 0.0
+        )
     systematic_errors = fit_systematic_errors(
         flight,
         axes,
@@ -284,7 +290,7 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
     needed_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_CLOCK_IMU_HZ
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
-    if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
+    if rate_hz >= MIN_IMU_RATE_RATIO * needed_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
@@ -300,32 +306,35 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     )
 
 
-def widen_for_drift(clock: ClockOffset) -> ClockOffset:
+def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """Widen the 95 % interval of the time offset of a source that may drift (odometry).
 
     Drift makes the estimates of different parts of the flight differ by more than noise, so the
     interval is widened by their scatter.
     """
-    offsets_s = np.array([part.offset_s for part in clock.parts])
-    weights = np.array([part.sigma_s**-2.0 for part in clock.parts])
-    if len(offsets_s) <= MIN_PARTS:
-        return structs.replace(clock, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None)
+    offsets_s = np.array([part.offset_s for part in clock_offset.parts])
+    weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
+    if len(offsets_s) <= MIN_PARTS_PER_SIDE:
+        return structs.replace(
+            clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
+        )
     sigma_factor = np.sqrt(
         max(1.0, _weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
     )
     low_s, high_s = (
-        clock.offset_s + sigma_factor * (limit_s - clock.offset_s) for limit_s in clock.interval_s
+        clock_offset.offset_s + sigma_factor * (limit_s - clock_offset.offset_s)
+        for limit_s in clock_offset.interval_s
     )
-    drift_reason = clock.reason
+    drift_reason = clock_offset.reason
     if not drift_reason and (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
         drift_reason = (
             "the time offset differs between parts of the flight, probably because the source "
             f"drifts (95 % {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
-        clock,
+        clock_offset,
         interval_s=(float(low_s), float(high_s)),
-        sigma_s=float(clock.sigma_s * sigma_factor),
+        sigma_s=float(clock_offset.sigma_s * sigma_factor),
         is_determinable=not drift_reason,
         reason=drift_reason,
         drift_ppm=None,
@@ -344,8 +353,8 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     Student's t-test of the mean offsets before and after each time, with Bonferroni correction.
     Changes below ``MIN_CHANGE_S`` are ignored.
     """
-    count = len(offsets_s)
-    split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)
+    part_count = len(offsets_s)
+    split_rows = range(MIN_PARTS_PER_SIDE, part_count - MIN_PARTS_PER_SIDE + 1)
     smallest_p = 1.0
     for split_row in split_rows:
         before_and_after = [
@@ -368,12 +377,12 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
                 _weighted_square_sum(side_offsets_s, side_weights)
                 for side_offsets_s, side_weights in before_and_after
             )
-            / (count - 2),
+            / (part_count - 2),
         )
         step_sigma_s = np.sqrt(
             variance_factor
             * sum(1.0 / np.sum(side_weights) for _, side_weights in before_and_after)
         )
-        p_value = 2.0 * float(stdtr(count - 2, -abs(step_s) / step_sigma_s))
+        p_value = 2.0 * float(stdtr(part_count - 2, -abs(step_s) / step_sigma_s))
         smallest_p = min(smallest_p, p_value * len(split_rows))
     return smallest_p if split_rows else None

@@ -67,7 +67,7 @@ def collect_events(comparison: Comparison) -> Events:
     time_s = np.concatenate([[start_s], comparison.lines[0].measurement_time_s, [end_s]])
 
     airborne = airborne_spans(flight)
-    flight_edges_s = [start_s, *(time for span in airborne for time in span), end_s]
+    flight_edges_s = [start_s, *(edge_s for span in airborne for edge_s in span), end_s]
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=source_gaps(time_s, comparison.source.rate_hz),
@@ -84,8 +84,8 @@ def collect_events(comparison: Comparison) -> Events:
             sorted({reset.time_s for reset in resets if start_s <= reset.time_s <= end_s})
         ),
         rejected_s={
-            result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
-            for result in comparison.axes.values()
-            if isinstance(frame := result.ekf2_innovations, pd.DataFrame)
+            axis_result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
+            for axis_result in comparison.axes.values()
+            if isinstance(frame := axis_result.ekf2_innovations, pd.DataFrame)
         },
     )

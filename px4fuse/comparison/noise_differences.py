@@ -14,9 +14,9 @@ from px4fuse.flight.model import Unavailable
 # Minimum ratio of the mean NIS along north and east for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
 # Maximum number of equal flight parts that are searched for a noisy part
-MAX_PARTS = 12
+MAX_PART_COUNT = 12
 # Minimum number of measurements in each flight part of the search for a noisy part
-MIN_PART_COUNT = 25
+MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
@@ -60,14 +60,14 @@ def find_noisy_part(
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    axes = [result.axis for result in north_and_east(comparison)]
+    axes = [axis_result.axis for axis_result in north_and_east(comparison)]
     if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
     increments_by_axis = [preintegrate(line, settings) for line in axes]
     time_s = axes[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
-    if len(time_s) < MAX_PARTS * MIN_PART_COUNT // 2:
+    if len(time_s) < MAX_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
         return None
-    part_count = min(MAX_PARTS, len(time_s) // MIN_PART_COUNT)
+    part_count = min(MAX_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:

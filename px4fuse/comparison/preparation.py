@@ -344,9 +344,9 @@ def choose_segment(
         reason = "positions available and vehicle airborne"
         if len(flights) > 1:
             others_text = ", ".join(
-                f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
-                for start, end in flights
-                if start != flight_start_s
+                f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
+                for start_s, end_s in flights
+                if start_s != flight_start_s
             )
             reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
         if not max(flight_start_s, first_s) < min(flight_end_s, last_s):
@@ -370,10 +370,10 @@ def choose_segment(
             f"{flight_end_s:.6g} s; the position source runs from "
             f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
         )
-    start, end = max(flight_start_s, first_s), min(flight_end_s, last_s)
-    if start >= end:
-        start, end = flight_start_s, flight_end_s
-    segment = Segment(start, end, reason, (flight_start_s, flight_end_s))
+    segment_start_s, segment_end_s = max(flight_start_s, first_s), min(flight_end_s, last_s)
+    if segment_start_s >= segment_end_s:
+        segment_start_s, segment_end_s = flight_start_s, flight_end_s
+    segment = Segment(segment_start_s, segment_end_s, reason, (flight_start_s, flight_end_s))
     position_count = len(cut_to_segment(track.samples, segment))
     if position_count < MIN_MEASUREMENTS:
         raise SettingsError(

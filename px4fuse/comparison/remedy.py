@@ -29,14 +29,16 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     """Estimate the delay of GNSS and its σ (ms), if EKF2 fused vision and GNSS velocity.
 
     The delay minimises the NIS of GNSS in re-runs of EKF2 with other values of EKF2_GPS_DELAY.
-    Return None if it does not differ significantly from the flown delay.
+    Return None if it does not differ significantly from the logged delay.
     """
     received = model.inputs.received
     if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
         return None
     nis_sums = []
     for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
-        updates = replay.updates[inside_spans(replay.updates.index, model.flown.evaluated_s)]
+        updates = replay.updates[
+            inside_spans(replay.updates.index, model.baseline_replay.evaluated_s)
+        ]
         nis = [
             updates[f"innovation_{axis}_{unit}"] ** 2
             / updates[f"innovation_variance_{axis}_{variance_unit}"]
@@ -61,7 +63,7 @@ def ml_ekf2_parameters(
     comparison: Comparison,
     model: Model,
     tuning: Tuning,
-    clock: ClockOffset | Unavailable,
+    clock_offset: ClockOffset | Unavailable,
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of EKF2's noise and delay parameters.
 
@@ -91,7 +93,7 @@ def ml_ekf2_parameters(
         and (max(noise_m, used_m) > min_vision_noise_m)
     ):
         changes |= ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
-    return changes | ml_delay_change(comparison, inputs, clock)
+    return changes | ml_delay_change(comparison, inputs, clock_offset)
 
 
 def is_source_fused(comparison: Comparison, inputs: Inputs) -> bool:
@@ -101,25 +103,27 @@ def is_source_fused(comparison: Comparison, inputs: Inputs) -> bool:
 
 
 def ml_delay_change(
-    comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
+    comparison: Comparison, inputs: Inputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
-    ml_delay_ms = wrong_delay_ms(comparison, clock, inputs.settings[inputs.aid.delay])
+    ml_delay_ms = wrong_delay_ms(comparison, clock_offset, inputs.settings[inputs.aid.delay])
     return {} if ml_delay_ms is None else delay_change(inputs, ml_delay_ms)
 
 
 def wrong_delay_ms(
-    comparison: Comparison, clock: ClockOffset, logged_delay_ms: float
+    comparison: Comparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
-    ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock.offset_s)
-    return ml_delay_ms if clock.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
+    ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
+    return (
+        ml_delay_ms if clock_offset.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
+    )
 
 
-def delay_limit(name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
+def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
     """Return the limit of PX4 that a delay violates, for example "exceed 300 ms"."""
-    if ml_delay_ms > (maximum_ms := PARAMETERS[name].maximum):
+    if ml_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
 

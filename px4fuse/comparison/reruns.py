@@ -77,7 +77,7 @@ NO_DIFFERENCE = Unavailable(
 )
 # Maximum ratio of RMSE or σ ratio between log and EKF2 replay, for a comparison of re-runs with the
 # log instead of the replay
-MAX_REPLAY_FACTOR = 1.10
+MAX_REPLAY_LOG_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -151,18 +151,18 @@ def rerun_filters(
     ):
         replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
 
-        def rerun_ekf2(result: AxisComparison, change: Change) -> RunStatistics:
+        def rerun_ekf2(axis_result: AxisComparison, change: Change) -> RunStatistics:
             key = frozenset(change.items())
             if key not in replays:
                 replays[key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _replay_statistics(comparison, model, replays[key], result, change)
+            return _replay_statistics(comparison, model, replays[key], axis_result, change)
 
         filters.append(_Filter("ekf2", rerun_ekf2, model))
     return tuple(
         trial
         for tested_filter in filters
-        for result in comparison.axes.values()
-        for trial in _try_changes(comparison, estimates, tested_filter, result)
+        for axis_result in comparison.axes.values()
+        for trial in _try_changes(comparison, estimates, tested_filter, axis_result)
     )
 
 
@@ -175,8 +175,8 @@ def planned_configurations(
     logged_parameters = inputs.settings
     return [
         FilterConfiguration({**logged_parameters, **change})
-        for result in comparison.axes.values()
-        for change, _ in _changes_along(comparison, estimates, inputs, result)
+        for axis_result in comparison.axes.values()
+        for change, _ in _changes_along(comparison, estimates, inputs, axis_result)
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -187,12 +187,12 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 
 
 def _changes_along(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None, result: AxisComparison
+    comparison: Comparison, estimates: Estimates, inputs: Inputs | None, axis_result: AxisComparison
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
     """Return each change to try along an axis, with the statistics that it may correct."""
-    summary = result.filters["kf" if inputs is None else "ekf2"]
+    summary = axis_result.filters["kf" if inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
-        inputs is not None and result.axis.name == "down"
+        inputs is not None and axis_result.axis.name == "down"
     ):
         return []  # an EKF2 replay has no vertical position
     has_discrepancy = {
@@ -200,12 +200,12 @@ def _changes_along(
         "nis": is_inconsistent(summary),
     }
     candidates = {
-        statistic: candidate_changes(comparison, estimates, inputs, result, statistic)
+        statistic: candidate_changes(comparison, estimates, inputs, axis_result, statistic)
         for statistic in DISCREPANCIES
         if has_discrepancy[statistic]
     }
     changes = unique_changes(chain.from_iterable(candidates.values()))
-    if result is comparison.main:
+    if axis_result is comparison.main:
         changes = main_axis_changes(comparison, estimates, inputs)
     return [
         (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
@@ -214,18 +214,21 @@ def _changes_along(
 
 
 def _try_changes(
-    comparison: Comparison, estimates: Estimates, tested_filter: _Filter, result: AxisComparison
+    comparison: Comparison,
+    estimates: Estimates,
+    tested_filter: _Filter,
+    axis_result: AxisComparison,
 ) -> list[Trial]:
-    changes = _changes_along(comparison, estimates, tested_filter.inputs, result)
+    changes = _changes_along(comparison, estimates, tested_filter.inputs, axis_result)
     if not changes:
         return []
-    before, is_logged = _flown_statistics(tested_filter, result)
+    before, is_logged = _unchanged_statistics(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
-        after = tested_filter.rerun(result, change)
+        after = tested_filter.rerun(axis_result, change)
         return Trial(
             filter=tested_filter.name,
-            axis=result.axis.name,
+            axis=axis_result.axis.name,
             kinds=change_kinds(comparison, tested_filter.inputs, change),
             change=change,
             discrepancies=tuple(
@@ -238,41 +241,48 @@ def _try_changes(
             after=after,
             from_s=None
             if tested_filter.model is None
-            else tested_filter.model.flown.evaluated_s[0][0],
+            else tested_filter.model.baseline_replay.evaluated_s[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
     for statistic in DISCREPANCIES:
         helpful = helpful_trials(trials, statistic)
         trials += [
-            make_trial({**helpful[0].change, **other.change}, (statistic,)) for other in helpful[1:]
+            make_trial({**helpful[0].change, **other_trial.change}, (statistic,))
+            for other_trial in helpful[1:]
         ]
     return trials
 
 
-def _flown_statistics(tested_filter: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter as flown, and False if they are from EKF2's replay."""
-    replayed_statistics, logged_state = tested_filter.rerun(result, {}), result.ekf2_state
+def _unchanged_statistics(
+    tested_filter: _Filter, axis_result: AxisComparison
+) -> tuple[RunStatistics, bool]:
+    """Return the statistics of the logged filter, and False if they are from EKF2's replay."""
+    replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.model is None:
         return replayed_statistics, True
-    innovations = result.ekf2_innovations
+    innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.flown.evaluated_s
+    compared_s = tested_filter.model.baseline_replay.evaluated_s
     compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
     innovations = innovations[inside_spans(innovations.index, compared_s)]
     rejected_flags = innovations["rejected"].dropna()
-    logged_statistics = _statistics(
+    logged_statistics = _run_statistics(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
-        error_statistics(compared_state, result.ekf2_variance, result.truth),
-        difference(result.replay, compared_state),
+        error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
+        difference(axis_result.replay, compared_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     logged_and_replayed = (
-        (logged_statistics.position_rmse_m, replayed_statistics.position_rmse_m, MAX_REPLAY_FACTOR),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_FACTOR**2),
-        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_FACTOR**2),
+        (
+            logged_statistics.position_rmse_m,
+            replayed_statistics.position_rmse_m,
+            MAX_REPLAY_LOG_RATIO,
+        ),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_LOG_RATIO**2),
+        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_LOG_RATIO**2),
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
@@ -282,7 +292,7 @@ def _flown_statistics(tested_filter: _Filter, result: AxisComparison) -> tuple[R
     return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
 
 
-def _statistics(
+def _run_statistics(
     innovation_m: Array,
     variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
@@ -308,14 +318,14 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 def _rerun_kf(
-    comparison: Comparison, tuning: Tuning, result: AxisComparison, change: Change
+    comparison: Comparison, tuning: Tuning, axis_result: AxisComparison, change: Change
 ) -> RunStatistics:
-    source, segment, axis = comparison.source, comparison.segment, result.axis
+    source, segment, axis = comparison.source, comparison.segment, axis_result.axis
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
-    settings = replace(comparison.settings, **kf_settings)
-    truth, is_gnss_rotation = result.truth, ROTATION in change and source.origin.is_gnss
+    changed_settings = replace(comparison.settings, **kf_settings)
+    truth, is_gnss_rotation = axis_result.truth, ROTATION in change and source.origin.is_gnss
     if ROTATION in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
         measured_m = weighted_sum(
@@ -333,14 +343,14 @@ def _rerun_kf(
     is_used = np.ones(len(time_s), dtype=bool)
     if OUTLIERS in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
-    shift_s = settings.clock_offset_s - comparison.settings.clock_offset_s
+    shift_s = changed_settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
         axis,
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    kf_run, ekf2_state = replay(axis, settings, fast=True), result.ekf2_state
-    return _statistics(
+    kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
+    return _run_statistics(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
         kf_error_statistics(kf_run, truth, ekf2_state),
@@ -367,7 +377,7 @@ def _replay_ekf2(
     comparison: Comparison, tuning: Tuning, model: Model, change: Change
 ) -> Ekf2Replay:
     if not change:
-        return model.flown
+        return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
@@ -386,36 +396,36 @@ def _replay_statistics(
     comparison: Comparison,
     model: Model,
     ekf2_replay: Ekf2Replay,
-    result: AxisComparison,
+    axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    compared_s, axis = model.flown.evaluated_s, result.axis
+    compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
-    direction_cosines, updates = axis.direction[:2], ekf2_replay.updates
-    updates = updates[inside_spans(updates.index, compared_s)]
-    innovation_variance_m2 = weighted_sum(updates, UPDATE_COLUMNS[2:4], direction_cosines**2)
+    direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
+    ekf2_updates = ekf2_updates[inside_spans(ekf2_updates.index, compared_s)]
+    innovation_variance_m2 = weighted_sum(ekf2_updates, UPDATE_COLUMNS[2:4], direction_cosines**2)
     prior_m2 = innovation_variance_m2 - weighted_sum(
-        updates, OBSERVATION_VARIANCES, direction_cosines**2
+        ekf2_updates, OBSERVATION_VARIANCES, direction_cosines**2
     )
-    posterior_m2 = weighted_sum(updates, POSITION_VARIANCES, direction_cosines**2)
-    variance = pd.DataFrame(
+    posterior_m2 = weighted_sum(ekf2_updates, POSITION_VARIANCES, direction_cosines**2)
+    variance_by_time = pd.DataFrame(
         {
             "position_variance_m2": 0.5 * (prior_m2 + posterior_m2),
             "velocity_variance_m2_s2": np.nan,
         },
-        index=pd.Index(updates["fused_at_s"].to_numpy()),
+        index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
     )
     published = project(ekf2_replay.published, axis, comparison.segment)
     published = published[inside_spans(published.index, compared_s)]
-    logged_state, compared_track = result.ekf2_state, published
+    logged_state, compared_track = axis_result.ekf2_state, published
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = logged_state[inside_spans(logged_state.index, compared_s)]
-    return _statistics(
-        weighted_sum(updates, UPDATE_COLUMNS[:2], direction_cosines),
+    return _run_statistics(
+        weighted_sum(ekf2_updates, UPDATE_COLUMNS[:2], direction_cosines),
         innovation_variance_m2,
-        error_statistics(published, variance, result.truth),
-        difference(result.replay, compared_track),
-        float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
+        error_statistics(published, variance_by_time, axis_result.truth),
+        difference(axis_result.replay, compared_track),
+        float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
     )

@@ -74,7 +74,7 @@ class Trial(Record, frozen=True, kw_only=True):
     discrepancies : tuple of {"nis", "nees"}
         Statistics outside their limits that the change may correct.
     before, after : RunStatistics
-        Statistics as flown and with the change, over the same samples.
+        Statistics without and with the change, over the same samples.
     is_logged : bool
         False if ``before`` is from a replay of EKF2 instead of the log.
     from_s : float or None
@@ -187,7 +187,7 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
-def distance_from_one(statistics: RunStatistics) -> float:
+def log_ratio_sum(statistics: RunStatistics) -> float:
     """Return the sum of |ln σ ratio| against source and ground truth."""
     squared_ratios = [
         squared_ratio
@@ -203,7 +203,7 @@ def preference(trial: Trial) -> tuple[bool, int, float]:
     return (
         not is_solved,
         len(trial.change) if is_solved else 0,
-        distance_from_one(trial.after),
+        log_ratio_sum(trial.after),
     )
 
 
@@ -217,8 +217,8 @@ def ratios(statistics: RunStatistics) -> dict[Reference, float]:
 
 
 def reduction(trial: Trial) -> float:
-    """Return the decrease of the sum of |ln σ ratio| (:func:`distance_from_one`) by a re-run."""
-    return distance_from_one(trial.before) - distance_from_one(trial.after)
+    """Return the decrease of the sum of |ln σ ratio| (:func:`log_ratio_sum`) by a re-run."""
+    return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
 
 
 def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
@@ -294,7 +294,7 @@ def has_effect(trial: Trial) -> bool:
     )
 
 
-def can_improve(trial: Trial) -> bool:
+def can_show_improvement(trial: Trial) -> bool:
     """Return True if a re-run could show an improvement.
 
     This requires ground truth or a σ ratio that is inconsistent before the change.

@@ -29,16 +29,16 @@ MIN_SIGMA_M = 0.05
 # Minimum σ (m) of the vertical residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
-FREEDOM = 4.0
+DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
 UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # Maximum rotation (rad) of the frame about the vertical that is a misalignment
-SMALL_ROTATION = np.radians(8.0)
+SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
-# Log prior odds of a frame that is rotated by more than SMALL_ROTATION
+# Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
 ROTATION_ODDS = -1.0
-# Log prior odds of a frame that is rotated by less than SMALL_ROTATION, but not by zero
+# Log prior odds of a frame that is rotated by less than SMALL_ROTATION_RAD, but not by zero
 SMALL_ROTATION_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_OFFSET_S
 OFFSET_ODDS = -2.0
@@ -51,18 +51,18 @@ BAROMETER_WEIGHT = 6.0
 # Limit (m) of height errors in the likelihood, which limits the effect of outliers
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
-MAX_REFINED = 8
+MAX_REFINED_HYPOTHESES = 8
 # Maximum log-likelihood difference from the best hypothesis for a refinement
-MAX_DEFICIT = 60.0
+MAX_SCORE_DEFICIT = 60.0
 # Maximum number of second differences in the refinement of a hypothesis
-MAX_ROWS = 1200
+MAX_REFINEMENT_ROWS = 1200
 # Number of Gauss-Newton iterations in the refinement of a hypothesis
-ITERATIONS = 7
+REFINEMENT_ITERATIONS = 7
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
-MAX_STEP_S = 0.15
+MAX_OFFSET_STEP_S = 0.15
 # Prior precision (σ⁻²) of the seven Hypothesis.parameters: heading drift of the gyroscopes (σ
 # 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
-PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
+PARAMETER_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
@@ -101,15 +101,15 @@ class Family(NamedTuple):
 
     def axes(self, quarter: int) -> Axes:
         """Return the directions of x, y, z with ``axis_a`` at ``quarter`` · 90° from north."""
-        names: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        names[self.axis_a] = CLOCKWISE[quarter % 4]
-        names[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
-        return names[0], names[1], names[2]
+        directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
+        directions[self.axis_a] = CLOCKWISE[quarter % 4]
+        directions[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
+        return directions[0], directions[1], directions[2]
 
     def log_odds(self, quarter: int) -> float:
         axes = self.axes(quarter)
-        other = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other)
+        other_axes_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
+        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_odds)
 
 
 FAMILIES = tuple(
@@ -128,7 +128,7 @@ class SentPositions:
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "SentPositions":
-        return replace(self, time_s=without_drift(self.time_s, drift))
+        return replace(self, time_s=without_clock_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
@@ -196,7 +196,7 @@ class Hypothesis:
         return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
 
 
-def without_drift(time_s: Array, drift: float) -> Array:
+def without_clock_drift(time_s: Array, drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
     middle_s = float(np.mean(time_s))
     return middle_s + (time_s - middle_s) / (1.0 + drift)
@@ -214,14 +214,18 @@ def search(
         source_motion = positions.motion(imu_motion)
         for candidate in find_candidates(source_motion, imu_motion):
             start_hypothesis = replace(candidate, heading_from=heading_from)
-            hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
-            if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
+            hypotheses.append(
+                refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
+            )
+            if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION_RAD:
                 parameters = start_hypothesis.parameters.copy()
                 parameters[1] -= candidate.remainder_rad
                 start_hypothesis = replace(
                     start_hypothesis, parameters=parameters, has_rotation=False
                 )
-                hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
+                hypotheses.append(
+                    refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
+                )
     return sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
@@ -297,20 +301,20 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
-        for hypothesis in hypotheses[:MAX_REFINED]
-        if hypothesis.score > hypotheses[0].score - MAX_DEFICIT
+        for hypothesis in hypotheses[:MAX_REFINED_HYPOTHESES]
+        if hypothesis.score > hypotheses[0].score - MAX_SCORE_DEFICIT
     ]
 
 
-def refine(
+def refine_hypothesis(
     start: Hypothesis, positions: SentPositions, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
-    rows = rows[:: max(1, len(rows) // MAX_ROWS)]
+    rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
     best, parameters = replace(start, score=-np.inf), start.parameters
-    for _ in range(ITERATIONS):
-        hypothesis, step = _evaluate(
+    for _ in range(REFINEMENT_ITERATIONS):
+        hypothesis, step = _evaluate_hypothesis(
             replace(start, parameters=parameters), rows, source_motion, imu_motion
         )
         if hypothesis.score > best.score:
@@ -319,7 +323,7 @@ def refine(
     return replace(best, score=best.score + _log_odds(best, positions))
 
 
-def _evaluate(
+def _evaluate_hypothesis(
     hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
@@ -338,7 +342,7 @@ def _evaluate(
     if independent_count * WINDOW_S < MIN_OVERLAP_S:
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     grid_index, time_s = grid_index[is_used], time_s[is_used]
-    flown_s = time_s - time_s[0]
+    elapsed_s = time_s - time_s[0]
     grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
     imu_table = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
@@ -348,7 +352,7 @@ def _evaluate(
         hypothesis.family,
     )
     unit_m = UNITS[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * flown_s))
+    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -371,7 +375,9 @@ def _evaluate(
     log_likelihood_gain -= sum(
         student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_known]
     )
-    weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / FREEDOM)
+    weight = 1.0 / (
+        np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / DEGREES_OF_FREEDOM
+    )
     weight *= row_s / WINDOW_S
     ned_square, source_imu_product, imu_square = (
         float(np.sum(weight[0] @ (first * second)[:, :2]))
@@ -384,10 +390,10 @@ def _evaluate(
     # without motion the convention is unknown
     if 0.0 in (ned_square, source_imu_product, imu_square):
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
-    jacobian = np.zeros((len(grid_index), 3, len(PRECISION)))
+    jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRECISION)))
     jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
-    jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
+    jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = imu_table[..., 1:]
     is_drifting = hypothesis.heading_from != "EKF2"
@@ -399,15 +405,18 @@ def _evaluate(
         jacobian[..., is_free].reshape(-1, is_free.sum()),
     )
     weighted_columns = columns.T * weights
-    normal_matrix = weighted_columns @ columns + np.diag(PRECISION[is_free] + 1e-9)
-    gradient = weighted_columns @ residual.ravel() + (PRECISION * hypothesis.parameters)[is_free]
-    parameter_step = np.zeros(len(PRECISION))
+    normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRECISION[is_free] + 1e-9)
+    gradient = (
+        weighted_columns @ residual.ravel() + (PARAMETER_PRECISION * hypothesis.parameters)[is_free]
+    )
+    parameter_step = np.zeros(len(PARAMETER_PRECISION))
     parameter_step[is_free] = -np.linalg.solve(normal_matrix, gradient)
-    parameter_step[0] = np.clip(parameter_step[0], -MAX_STEP_S, MAX_STEP_S)
+    parameter_step[0] = np.clip(parameter_step[0], -MAX_OFFSET_STEP_S, MAX_OFFSET_STEP_S)
     scored_hypothesis = replace(
         hypothesis,
         score=float(
-            independent_count * log_likelihood_gain - 0.5 * PRECISION @ hypothesis.parameters**2
+            independent_count * log_likelihood_gain
+            - 0.5 * PARAMETER_PRECISION @ hypothesis.parameters**2
         ),
         scale=source_imu_product / imu_square,
         max_scale=ned_square / source_imu_product,
@@ -421,10 +430,12 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
     """Fit a Student distribution to squared residuals; return mean log likelihood and scale."""
     variance = max(float(np.median(squares)) / (0.455, 1.386)[dimensions - 1], min_sigma**2)
     for _ in range(5):
-        weight = (FREEDOM + dimensions) / (FREEDOM + squares / variance)
+        weight = (DEGREES_OF_FREEDOM + dimensions) / (DEGREES_OF_FREEDOM + squares / variance)
         variance = max(float(np.mean(weight * squares)) / dimensions, min_sigma**2)
-    mean_log_tail = np.mean(np.log1p(squares / variance / FREEDOM))
-    score = -0.5 * (dimensions * np.log(variance) + (FREEDOM + dimensions) * mean_log_tail)
+    mean_log_tail = np.mean(np.log1p(squares / variance / DEGREES_OF_FREEDOM))
+    score = -0.5 * (
+        dimensions * np.log(variance) + (DEGREES_OF_FREEDOM + dimensions) * mean_log_tail
+    )
     return float(score), float(np.sqrt(variance))
 
 
@@ -435,7 +446,7 @@ def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
-        is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION
+        is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
         log_odds += ROTATION_ODDS if is_large else SMALL_ROTATION_ODDS
     if positions.barometer is not None:
         log_odds += _height_log_likelihood(hypothesis, positions, *positions.barometer)

@@ -7,12 +7,12 @@ from msgspec import structs
 
 from px4fuse.convention.axes import (
     MAX_OFFSET_S,
-    SMALL_ROTATION,
+    SMALL_ROTATION_RAD,
     UNITS,
     Hypothesis,
     SentPositions,
     find_candidates,
-    refine,
+    refine_hypothesis,
     search,
 )
 from px4fuse.convention.model import (
@@ -37,9 +37,9 @@ from px4fuse.trajectory.rotation import heading
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
 # Minimum log-likelihood gain of a convention over positions unrelated to the motion
-MIN_GAIN = 8.0
+MIN_LIKELIHOOD_GAIN = 8.0
 # Minimum log-likelihood gain per independent sample: unambiguous, ambiguous convention
-MIN_GAIN_PER_WINDOW = (0.15, 0.4)
+MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Range of the scale of a convention (source's distances ÷ IMU's distances) that is not doubtful
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
 # Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
@@ -52,15 +52,15 @@ MAX_LOGGED_DEFICIT = 20.0
 # Minimum log-likelihood gain by a clock drift that is corrected
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
-DRIFTS = np.linspace(-0.05, 0.05, 21)
+TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # Maximum fraction of repeated positions that are ignored
 MAX_REPEATED_FRACTION = 0.5
 # Minimum fraction of positions with a height for the use of heights
 MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
-THIRD_DIFFERENCE = 20.0
+THIRD_DIFFERENCE_VARIANCE = 20.0
 # Variance of second differences of white noise with variance 1
-SECOND_DIFFERENCE = 6.0
+SECOND_DIFFERENCE_VARIANCE = 6.0
 
 
 def check_convention(
@@ -87,17 +87,17 @@ def check_convention(
     motions = {
         name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
     }
-    hypotheses = _search(positions, motions)
+    hypotheses = _search_hypotheses(positions, motions)
     if not hypotheses:
         return Convention(verdict="not determinable")
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.with_clock_drift(clock_drift)
-        with_drift = _search(positions_without_drift, motions)
+        with_drift = _search_hypotheses(positions_without_drift, motions)
         if with_drift and with_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN:
             hypotheses, positions = with_drift, positions_without_drift
         else:
             clock_drift = 0.0
-    convention = _decide(hypotheses, positions, clock_drift)
+    convention = _choose_convention(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
     orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
@@ -121,21 +121,23 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     )
 
 
-def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
+def _search_hypotheses(
+    positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
+) -> list[Hypothesis]:
     """Return the likely conventions, best first; the logged heading is preferred."""
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
             and hypothesis.score > hypotheses[0].score - MAX_LOGGED_DEFICIT
-            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION)
+            and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
             return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
     return hypotheses
 
 
-def _decide(
+def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
     """Decide whether the best convention is unambiguous and its residuals are plausible."""
@@ -152,11 +154,11 @@ def _decide(
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
     verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
-    if best_hypothesis.score < MIN_GAIN:
+    if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
         best_hypothesis.score
-        < MIN_GAIN_PER_WINDOW[is_ambiguous] * best_hypothesis.independent_count
+        < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_count
         or best_hypothesis.scale > MAX_SCALE
         or best_hypothesis.max_scale < MIN_SCALE
         or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
@@ -164,7 +166,7 @@ def _decide(
         verdict = "doubtful"
     x, y, z = best_hypothesis.axes
     likely_conventions = [
-        _describe(hypothesis)
+        _describe_hypothesis(hypothesis)
         for hypothesis in other_conventions
         if hypothesis.score > best_hypothesis.score - MIN_LOG_ODDS
     ]
@@ -187,7 +189,7 @@ def _decide(
     )
 
 
-def _describe(hypothesis: Hypothesis) -> str:
+def _describe_hypothesis(hypothesis: Hypothesis) -> str:
     rotation = (
         f", rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°"
         if hypothesis.has_rotation
@@ -208,7 +210,9 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
     noise_m = (
-        UNITS[hypothesis.unit] * residual_deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+        UNITS[hypothesis.unit]
+        * residual_deviation
+        * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
     return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
@@ -216,10 +220,10 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
 def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
     start_drift = 0.0
-    if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
+    if best.score < MIN_LIKELIHOOD_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
             (candidates[0], clock_drift)
-            for clock_drift in DRIFTS.tolist()
+            for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
                 candidates := find_candidates(
                     positions.with_clock_drift(clock_drift).motion(imu), imu
@@ -229,7 +233,9 @@ def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> 
         best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
         best = replace(best_candidate, heading_from=best.heading_from)
         positions = positions.with_clock_drift(start_drift)
-    hypothesis = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
+    hypothesis = refine_hypothesis(
+        replace(best, has_clock_drift=True), positions, positions.motion(imu), imu
+    )
     clock_drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
     return clock_drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
 

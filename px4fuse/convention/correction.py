@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE, UNITS, without_drift
+from px4fuse.convention.axes import CLOCKWISE, UNITS, without_clock_drift
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
@@ -30,7 +30,7 @@ MIN_REMAINDER_DEG = 8.0
 # error
 MIN_ROTATION_DEG = 15.0
 # Minimum delay (s) that is corrected with the convention; a smaller one is a time offset
-MIN_LATE_S = 0.5
+MIN_CORRECTED_DELAY_S = 0.5
 # Minimum heading difference (°) between a wrong orientation and the motion of its source
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
@@ -70,7 +70,7 @@ class Faults:
     is_ambiguous: bool = False
 
     @property
-    def of_positions(self) -> bool:
+    def has_position_fault(self) -> bool:
         """True if axes, rotation, unit or timestamps of the positions are wrong."""
         return bool(
             self.has_wrong_axes
@@ -121,12 +121,14 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         has_wrong_axes=has_wrong_axes,
         rotation_deg=rotation_deg,
         has_wrong_unit=convention.unit != "m",
-        late_s=convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0,
+        late_s=convention.late_s if abs(convention.late_s) >= MIN_CORRECTED_DELAY_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=orientation_fault,
         is_north_unknown=has_wrong_axes and has_own_heading,
     )
-    return replace(faults, affects_ekf2=is_fused and (faults.of_positions or has_wrong_heading))
+    return replace(
+        faults, affects_ekf2=is_fused and (faults.has_position_fault or has_wrong_heading)
+    )
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
@@ -213,4 +215,4 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
-    return time_index(without_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)
+    return time_index(without_clock_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)

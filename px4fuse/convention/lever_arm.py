@@ -27,13 +27,13 @@ MIN_TRUE_ARM_SIGMAS = 5.0
 # Maximum lever arm (m) that is reported: a larger one is a frame error of the position source
 MAX_ARM_M = 5.0
 # Maximum residual (σ) of a sample that is used in the next fit of the lever arm
-CLIPPED_SIGMAS = 3.0
+MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
 MIN_SINGULAR_RATIO = 0.02
 # Minimum number of position coordinates in the lever arm fit with ground truth
-MIN_ROWS = 40
+MIN_COORDINATES = 40
 # Number of lever arm fits; each excludes the outliers of the previous one
-ITERATIONS = 4
+FIT_COUNT = 4
 
 
 class LeverArm(NamedTuple):
@@ -79,7 +79,7 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     design = np.concatenate([rotation, identity_columns, velocity_m_s[:, :, None]], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
     design_rows, known_errors_m = design[is_known].reshape(-1, 5), error_m[is_known].ravel()
-    if len(design_rows) < MIN_ROWS:
+    if len(design_rows) < MIN_COORDINATES:
         return None
     fitted_parameters, _, rank, _ = np.linalg.lstsq(
         design_rows, known_errors_m, rcond=MIN_SINGULAR_RATIO
@@ -113,7 +113,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
         [arm_differences, imu_motion.rate_m_s[:, :2, None], imu_motion.table[:, :2, 1:]], axis=2
     )
     time_s, is_used = position_samples.index.to_numpy(), imu_motion.is_valid
-    for _ in range(ITERATIONS):
+    for _ in range(FIT_COUNT):
         source_motion = SourceMotion.of(time_s, position_samples.to_numpy(), imu_motion.time_s)
         is_used = is_used & source_motion.is_valid
         difference_m = source_motion.table - imu_motion.table[:, :2, 0]
@@ -135,7 +135,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
             / independent_count
         )
         arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
-        is_used &= residual_m < CLIPPED_SIGMAS * sigma_m
+        is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # the third parameter is the time by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
     lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), arm_sigma_m)

@@ -141,16 +141,18 @@ def read_inertial(flight: Flight) -> Inertial | None:
     integral_steps = np.diff([np.interp(time_s, imu_s, column) for column in imu_integral.T]).T
     force_m_s2 = integral_steps[:, :3] / STEP_S
     logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    gyro_attitude = _level(_integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2)
+    gyro_attitude = _level_attitude(
+        _integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2
+    )
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
     gap_rows = np.flatnonzero(imu_gaps(imu_s))
     recorded_spans_s = zip([-np.inf, *imu_s[gap_rows + 1]], [*imu_s[gap_rows], np.inf], strict=True)
     valid_spans_s = (
-        (max(start, begin), min(stop, end))
-        for begin, end in recorded_spans_s
-        for start, stop in airborne
+        (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
+        for recorded_from_s, recorded_until_s in recorded_spans_s
+        for flight_start_s, flight_end_s in airborne
     )
     return Inertial(
         time_s,
@@ -181,7 +183,7 @@ def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
     )
 
 
-def _level(attitude: Array, force_m_s2: Array) -> Array:
+def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
     mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
@@ -231,11 +233,11 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     )
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
-    position = np.zeros((len(attitude), 3, 4))
-    velocity = np.cumsum(table, axis=0) * STEP_S
-    np.cumsum((velocity - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
+    position_m = np.zeros((len(attitude), 3, 4))
+    velocity_m_s = np.cumsum(table, axis=0) * STEP_S
+    np.cumsum((velocity_m_s - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position_m[1:])
     window_steps, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
-    second_differences = second_difference(position, window_steps)[::stride]
+    second_differences = second_difference(position_m, window_steps)[::stride]
     time_s = inertial.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)

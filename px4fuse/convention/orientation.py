@@ -72,11 +72,11 @@ def check_orientation(
     Return the convention without ``heading_error_deg``, at most MAX_SAMPLES of the times in flight,
     and the attitudes (FRD to NED) at these times. ``quaternion``, shape (n, 4), is as sent.
     """
-    rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
-    if len(rows) < MIN_SAMPLES:
+    flight_rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
+    if len(flight_rows) < MIN_SAMPLES:
         return None
-    rows = rows[:: -(-len(rows) // MAX_SAMPLES)]
-    sample_s, sent_quaternions = time_s[rows], quaternion[rows]
+    flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_SAMPLES)]
+    sample_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
         logged_attitude = interpolate(sample_s - delay_s, inertial.time_s, inertial.logged_attitude)

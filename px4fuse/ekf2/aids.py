@@ -32,7 +32,7 @@ MIN_BIAS_RATIO = 0.5
 # Minimum |mean innovation| (√S) of a biased aiding source
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
-WINDOW_S = 10.0
+CHANGE_WINDOW_S = 10.0
 # Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
 # Minimum number of windows before a change of the mean normalised innovation
@@ -43,9 +43,9 @@ MIN_CHANGE_IN_SIGMA = 0.5
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
-NOT_FUSED_LIMIT_S = 5.0
+MAX_NOT_FUSED_S = 5.0
 # Maximum number of logging intervals without a fused sample of an enabled aiding source
-NOT_FUSED_INTERVALS = 10.0
+MAX_NOT_FUSED_INTERVALS = 10.0
 # Maximum relative difference between √R and the noise parameter from which R is computed
 NOISE_TOLERANCE = 0.02
 # Minimum height (m) above ground for statistics of aiding sources, because rotor downwash
@@ -188,7 +188,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     samples = aid_log.samples.loc[start_s:end_s]
     sample_s = samples.index.to_numpy()
     gate = _effective_gate(aid, aid_log)
-    innovation, variance = (
+    innovation, innovation_variance = (
         samples[[f"{quantity}_{axis}" for axis in aid_log.axes]].to_numpy()
         for quantity in ("innovation", "variance")
     )
@@ -198,7 +198,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
         flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
         is_grid_enabled = np.asarray(step_values_at(aid_log.enabled, flight_grid_s) > 0.0)
-        enabled_fraction = _fraction(is_grid_enabled, np.ones(len(flight_grid_s), bool))
+        enabled_fraction = _fraction_within(is_grid_enabled, np.ones(len(flight_grid_s), bool))
     fused_logged = "fused" in samples
     is_fused: BoolArray
     is_rejected: BoolArray
@@ -206,12 +206,12 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_fused, is_rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise_sigma = samples[[f"noise_{axis}" for axis in aid_log.axes]].to_numpy()
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
-        is_reset = ((innovation == 0.0) & np.isclose(variance, noise_sigma)).all(axis=1)
+        is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
         noise_median = (
             float(np.median(np.sqrt(noise_sigma[is_fused, 0]))) if is_fused.any() else None
         )
     else:
-        is_rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
+        is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
         is_reset = np.zeros(len(samples), bool)
         noise_median = None
@@ -220,7 +220,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
         consistency = assess(
-            innovation[is_evaluated, axis_index], variance[is_evaluated, axis_index], gate
+            innovation[is_evaluated, axis_index],
+            innovation_variance[is_evaluated, axis_index],
+            gate,
         )
         if not isinstance(consistency, Unavailable):
             axes[axis] = AidAxis(
@@ -238,7 +240,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 change=_largest_mean_change(
                     sample_s[is_evaluated],
                     innovation[is_evaluated, axis_index]
-                    / np.sqrt(variance[is_evaluated, axis_index]),
+                    / np.sqrt(innovation_variance[is_evaluated, axis_index]),
                 ),
             )
     return AidResult(
@@ -246,16 +248,16 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         unit=aid.unit,
         topic=aid_log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction(is_fused & is_enabled, is_enabled),
+        fused_fraction=_fraction_within(is_fused & is_enabled, is_enabled),
         fused_logged=fused_logged,
-        rejected_fraction=_fraction(is_rejected & is_enabled, is_enabled),
+        rejected_fraction=_fraction_within(is_rejected & is_enabled, is_enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, aid_log, noise_median),
         axes=axes,
-        verdict=_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
+        verdict=_aid_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
         if is_evaluated.any()
         else "disabled",
     )
@@ -267,7 +269,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     For each window, the mean of the two windows after it is compared with the mean before it. The
     change begins in the window itself if its own mean has changed by a third of that.
     """
-    window_index = np.floor((time_s - time_s[0]) / WINDOW_S)
+    window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
     window_means = windows["mean"].to_numpy()
@@ -282,12 +284,12 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
         if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
             has_begun = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
             first_window = windows.index[index if has_begun else index + 1]
-            largest_change = float(time_s[0] + WINDOW_S * first_window), mean_change
+            largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_window), mean_change
             min_change = abs(mean_change)
     return largest_change
 
 
-def _fraction(is_selected: BoolArray, is_in_set: BoolArray) -> float:
+def _fraction_within(is_selected: BoolArray, is_in_set: BoolArray) -> float:
     return float(is_selected.sum() / max(is_in_set.sum(), 1))
 
 
@@ -302,17 +304,17 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _noise_origin(aid: Aid, aid_log: AidLog, noise: float | None) -> str:
+def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the parameter whose value is √R, else the origin stated for the source."""
     parameter_value = aid_log.parameters.get(aid.noise)
-    if noise is None or parameter_value is None:
-        return "" if noise is None else aid.noise_origin
+    if noise_sigma is None or parameter_value is None:
+        return "" if noise_sigma is None else aid.noise_origin
     for expected_noise in (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
         np.sqrt(parameter_value),
     ):
-        if abs(noise - expected_noise) <= NOISE_TOLERANCE * expected_noise:
+        if abs(noise_sigma - expected_noise) <= NOISE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
 
@@ -337,10 +339,10 @@ def _longest_gap(
     return float(gap_ends_s[longest_index]), float(gap_ends_s[longest_index + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
+def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
-        NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s
+        MAX_NOT_FUSED_S, MAX_NOT_FUSED_INTERVALS * interval_s
     ):
         return "not_fused"
     if not axes:

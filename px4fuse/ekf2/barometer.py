@@ -14,7 +14,7 @@ import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.ekf2.bias import BIAS_DENSITY
+from px4fuse.ekf2.bias import BIAS_NOISE_DENSITY
 from px4fuse.ekf2.replay_segments import INNOVATION_FILTER_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
@@ -44,7 +44,7 @@ def sample_interval_s(fusion_record: FusionRecord) -> float:
     bias = fusion_record.height_bias.get(BAROMETER.name)
     if bias is not None and len(bias) > 1:
         variance_m2 = bias["variance_m2"] * _bias_gain(bias)
-        intervals_s = (variance_m2 - bias["bias_m2"])[len(bias) // 5 :] / BIAS_DENSITY**2
+        intervals_s = (variance_m2 - bias["bias_m2"])[len(bias) // 5 :] / BIAS_NOISE_DENSITY**2
         low_s, median_s, high_s = np.percentile(intervals_s, [25.0, 50.0, 75.0])
         if high_s - low_s < MAX_INTERVAL_SCATTER * median_s:
             return float(median_s)

@@ -11,9 +11,9 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 
 # Noise density (m/s/√Hz) of the random walk of the bias (bias_nsd, common.h)
-BIAS_DENSITY = 0.13
+BIAS_NOISE_DENSITY = 0.13
 # Minimum variance (m²) of the sensor bias
-MIN_VARIANCE_M2 = 1e-8
+MIN_BIAS_VARIANCE_M2 = 1e-8
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
 # Maximum |mean of test ratio · sign of the innovation| of a correct bias (isOffsetDetected)
@@ -59,7 +59,9 @@ class BiasEstimator:
             Number of samples that EKF2 fused per known sample.
         """
         has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
-        variance_rate = np.where(has_offset, RANDOM_WALK_FACTOR * BIAS_DENSITY**2, BIAS_DENSITY**2)
+        variance_rate = np.where(
+            has_offset, RANDOM_WALK_FACTOR * BIAS_NOISE_DENSITY**2, BIAS_NOISE_DENSITY**2
+        )
         bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, noise_m2)
         nu = nu + self.value_m
         R = noise_m2 + bias_variance
@@ -67,7 +69,7 @@ class BiasEstimator:
         test_ratio = nu * nu / (BIAS_GATE**2 * S)
         K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
         self.value_m = self.value_m - K * nu
-        self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_VARIANCE_M2)
+        self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_BIAS_VARIANCE_M2)
         ratio_change = np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_ratio
         self.mean_signed_ratio = self.mean_signed_ratio - (
             self.filter_weight * weight * updates_bias * ratio_change

@@ -79,10 +79,10 @@ MIN_BIAS_VARIANCE_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
 BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
-MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
+JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
-HORIZONTAL = slice(NORTH, EAST + 1)
+HORIZONTAL_POSITION = slice(NORTH, EAST + 1)
 # State indices of velocity and position, which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
 # Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
@@ -262,7 +262,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
     sample_index = np.maximum(intervals[0].events.sample, 0)
-    measured_values, noise = _measurements(
+    measured_values, measurement_variance = _measurements_by_event(
         inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
     )
     is_sequential = inputs.aid == GNSS_POS
@@ -445,7 +445,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
         if inputs.rules.min_bias_variance is not None:
-            _limit_bias(P, inputs.rules.min_bias_variance, has_biases)
+            _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
@@ -463,7 +463,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = heights.fuse_barometer(e, x, P)
         if has_sample[e]:
             nu = measured_values[e] - x[:, MEASURED_STATES]
-            S = _diagonal(P)[:, MEASURED_STATES] + noise[e]
+            S = _diagonal(P)[:, MEASURED_STATES] + measurement_variance[e]
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # EKF2 clips the vertical velocity if the horizontal velocity is inside the gate
@@ -490,13 +490,21 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
                 is_component_fused[:, POSITION_COLUMNS] = is_fused[e, :, None]
                 x, P = _sequential_update(
-                    x, P, nu, S, noise[e], measured_slice, is_component_fused[:, measured_slice]
+                    x,
+                    P,
+                    nu,
+                    S,
+                    measurement_variance[e],
+                    measured_slice,
+                    is_component_fused[:, measured_slice],
                 )
             else:
                 innovation[:, 2:] = nu[:, POSITION_COLUMNS]
-                R[is_fused[e], 2:] = noise[e, is_fused[e], POSITION_COLUMNS]
+                R[is_fused[e], 2:] = measurement_variance[e, is_fused[e], POSITION_COLUMNS]
         if heights is not None:
-            x, P = heights.fuse_gnss(e, x, P, measured_values[e, :, 5], noise[e, :, 5])
+            x, P = heights.fuse_gnss(
+                e, x, P, measured_values[e, :, 5], measurement_variance[e, :, 5]
+            )
         # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
@@ -510,16 +518,20 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 R[:, 1] = IGNORED_VARIANCE
                 if has_sample[e] and heights is None:
                     innovation[:, 1] = nu[:, 5]
-                    R[:, 1] = np.where(is_active[e], noise[e, :, 5], IGNORED_VARIANCE)
+                    R[:, 1] = np.where(
+                        is_active[e], measurement_variance[e, :, 5], IGNORED_VARIANCE
+                    )
             x, P = _joint_update(x, P, innovation, R)
             x[:, HEADING] = heading
         if has_sample[e] and is_reset[e].any():
-            reset_variance = inputs.rules.reset_variance_factor * noise[e, :, POSITION_COLUMNS]
+            reset_variance = (
+                inputs.rules.reset_variance_factor * measurement_variance[e, :, POSITION_COLUMNS]
+            )
             set_states(
                 x,
                 P,
                 is_reset[e],
-                HORIZONTAL,
+                HORIZONTAL_POSITION,
                 measured_values[e, :, POSITION_COLUMNS],
                 reset_variance,
             )
@@ -530,7 +542,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     is_reset[e],
                     VELOCITY,
                     measured_values[e, :, VELOCITY_COLUMNS],
-                    noise[e, :, VELOCITY_COLUMNS],
+                    measurement_variance[e, :, VELOCITY_COLUMNS],
                 )
             position_reset_m[e, is_reset[e]] = nu[is_reset[e], POSITION_COLUMNS]
         if vision is not None:
@@ -561,7 +573,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         tuple(interval_arrays.events for interval_arrays in intervals),
         innovations,
         variances,
-        noise,
+        measurement_variance,
         is_rejected,
         is_fused,
         is_reset,
@@ -577,9 +589,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
 def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
-    HP = np.take(P, MEASURED, axis=1)
-    HPH = np.take(HP, MEASURED, axis=2)
-    HPH.reshape(len(x), -1)[:, :: len(MEASURED) + 1] += R
+    HP = np.take(P, JOINTLY_MEASURED_STATES, axis=1)
+    HPH = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
+    HPH.reshape(len(x), -1)[:, :: len(JOINTLY_MEASURED_STATES) + 1] += R
     K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP
@@ -717,12 +729,12 @@ def _variance_growth(
 
     EKF2 adds no process noise to a state variance above the limit.
     """
-    names = {"GYR_B": "GYR", "ACC_B": "ACC"}
+    initial_and_process_names = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.field is not None:
-        names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
+        initial_and_process_names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
     noise_density, variance_limit = (
         np.stack([parameters[f"EKF2_{name}_NOISE"] for name in noises], axis=-1)
-        for noises in (names, names.values())
+        for noises in (initial_and_process_names, initial_and_process_names.values())
     )
     noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
     return np.repeat((noise_density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(
@@ -730,7 +742,7 @@ def _variance_growth(
     )
 
 
-def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
+def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
     """Estimate the correlations of the initial state of a segment; the log has variances only.
 
     Without correlations, the first updates would divide the error differently than EKF2 between
@@ -814,7 +826,7 @@ def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
     return noise_variance
 
 
-def _limit_bias(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
+def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
@@ -825,7 +837,7 @@ def _limit_bias(P: Array, absolute_minimum: float, has_biases: BoolArray) -> Non
     ]
 
 
-def _measurements(
+def _measurements_by_event(
     inputs: Inputs,
     segment: ReplaySegment,
     sample_index: IntArray,
@@ -839,7 +851,7 @@ def _measurements(
     offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None
     ]
-    measured_values, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
+    measured_values, measurement_variance = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
     lever_arm_ned = (segment.body_to_ned[event_steps] @ offset_m)[..., 0]
     measured_values[..., 3:] = received.position_m[sample_index][:, None] - lever_arm_ned
     if aid.noise_mode:
@@ -847,7 +859,7 @@ def _measurements(
     reported_variance = np.where(
         uses_reported_noise[:, None], received.variance_m2[sample_index][:, None], 0.0
     )
-    noise[..., 3:] = np.maximum(
+    measurement_variance[..., 3:] = np.maximum(
         reported_variance, np.maximum(parameters[aid.noise], MIN_SIGMA)[:, None] ** 2
     )
     if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
@@ -860,9 +872,11 @@ def _measurements(
         measured_values[..., :3] = received.velocity_m_s[sample_index][:, None] - lever_arm_ned
         reported_variance = received.velocity_variance_m2_s2[sample_index][:, None]
         min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_SIGMA)[:, None] ** 2
-        noise[..., :3] = np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
-    if aid == GNSS_POS:
-        noise[..., 5] = np.maximum(
-            noise[..., 5], (GNSS_HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
+        measurement_variance[..., :3] = (
+            np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
         )
-    return measured_values, noise
+    if aid == GNSS_POS:
+        measurement_variance[..., 5] = np.maximum(
+            measurement_variance[..., 5], (GNSS_HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
+        )
+    return measured_values, measurement_variance

@@ -32,7 +32,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     imu_velocity = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step_index]
     )
-    samples = SensorSamples(
+    sensor_samples = SensorSamples(
         step_index[:, 0],
         flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity,
         np.einsum("ki,kiab->kab", weight, rotation_to_body),
@@ -40,7 +40,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
         flow["noise_m2_s2"].to_numpy(),
         gate,
     )
-    return replace(segment, flow=samples)
+    return replace(segment, flow=sensor_samples)
 
 
 def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:

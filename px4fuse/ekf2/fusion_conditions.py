@@ -29,17 +29,17 @@ MAX_HORIZON_S = 1.0
 # Number of position samples in EKF2's buffer
 BUFFER_COUNT = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
-TIME_STEP_S = 5e-7
+INTERVAL_TOLERANCE_S = 5e-7
 # Time (s) with all samples rejected after which EKF2 stops fusion: no_aid_timeout_max
 MAX_REJECTED_S = 1.0
 # Maximum range (m) of constant positions, which are no measurement
 MAX_CONSTANT_RANGE_M = 1e-3
 # Minimum fraction of the time with a failed GNSS check that explains missing GNSS fusion
 MIN_FAILED_FRACTION = 0.1
-SET_TIMESTAMP = (
+SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
 )
-SYNCHRONISE = (
+SYNCHRONISE_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
@@ -81,7 +81,7 @@ class UnmetCondition(NamedTuple):
     action: str
 
 
-UNKNOWN = UnmetCondition(
+UNKNOWN_CONDITION = UnmetCondition(
     "",
     "",
     "The log does not contain the reason: the logged conditions of EKF2 are met.",
@@ -133,9 +133,9 @@ class Attempt:
 
 
 def find_unmet(attempt: Attempt) -> UnmetCondition:
-    """Return the first condition that is not met, in EKF2's order; UNKNOWN if all are met."""
+    """Return the first condition of EKF2 that is not met; UNKNOWN_CONDITION if all are met."""
     conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
-    return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN)
+    return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN_CONDITION)
 
 
 def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
@@ -200,7 +200,7 @@ def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
             "the timestamps are " + ("0" if clock == "0" else f"in {clock}"),
             "EKF2 reads timestamp_sample in microseconds since the autopilot's boot. For EKF2 the "
             f"positions are {STAMP_FAULTS[clock]}.",
-            SYNCHRONISE if clock in WRONG_CLOCKS else SET_TIMESTAMP,
+            SYNCHRONISE_ACTION if clock in WRONG_CLOCKS else SET_TIMESTAMP_ACTION,
         )
     if "age_s" not in status:
         return
@@ -212,10 +212,10 @@ def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
             "age",
             f"the timestamps are {-age_s:.2f} s in the future",
             f"EKF2 waits until this time, but buffers only {BUFFER_COUNT} positions.",
-            SYNCHRONISE,
+            SYNCHRONISE_ACTION,
         )
     if age_s > attempt.horizon_s + MAX_LATENESS_S:
-        action = SYNCHRONISE
+        action = SYNCHRONISE_ACTION
         if age_s < MAX_HORIZON_S:
             max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # rounded up to a multiple of 50 ms
             action = (
@@ -262,7 +262,7 @@ def _check_interval(attempt: Attempt) -> Iterator[UnmetCondition]:
     # a source that is reconstructed from EKF2 topics has the rate of the logger, not of the
     # positioning system
     is_known = attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
-    if is_known and intervals_s.min() >= EV_START_INTERVAL_S - TIME_STEP_S:
+    if is_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
         yield UnmetCondition(
             "interval",
             f"the positions come at {attempt.source.rate_hz:.2g} Hz",

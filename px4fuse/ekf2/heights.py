@@ -74,14 +74,14 @@ def add_heights(
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    measured_at_s, down_m, weight = np.zeros((3, 0))
+    measured_at_s, down_m, sample_weight = np.zeros((3, 0))
     if BAROMETER.name in fused_aids and flight.barometer is not None:
         barometer_down_m = flight.barometer["down_m"]
         barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
         fused_barometer = fused_samples(ekf2, fusion_record, barometer_down_m)
         measured_at_s = fused_barometer.index.to_numpy()
         down_m = fused_barometer["down_m"].to_numpy() + fusion_record.altitude_m
-        weight = fused_barometer["weight"].to_numpy()
+        sample_weight = fused_barometer["weight"].to_numpy()
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
         fusion_record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0
@@ -103,7 +103,7 @@ def add_heights(
                 for name in ("bias_m", "bias_m2")
             )
             barometer_bias = bias_m, bias_m2
-        columns = measured_at_s, down_m, dead_zone_m, weight
+        columns = measured_at_s, down_m, dead_zone_m, sample_weight
         samples_inside = barometer_samples_inside(segment, *columns)
         rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
@@ -221,9 +221,11 @@ class HeightFilter:
         for slot in (
             [barometer_slot_count] if sensor == GNSS_HGT.name else range(barometer_slot_count)
         ):
-            times = self.time_s[slot]
+            event_times_s = self.time_s[slot]
             has_sample = self.has_sample[slot][:, configuration_index]
-            measured_s = times[has_sample, min(configuration_index, times.shape[1] - 1)]
+            measured_s = event_times_s[
+                has_sample, min(configuration_index, event_times_s.shape[1] - 1)
+            ]
             updates = self.update_log[has_sample, slot, :, configuration_index].T
             update_rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
         measured_s, nu, S, is_fused, end_s = np.hstack(update_rows)

@@ -250,7 +250,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
             f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
-    if missing_imu := _missing_imu(imu.index.to_numpy()):
+    if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
     position_samples = (
         read_gnss(flight, ekf2, fusion_record)
@@ -344,7 +344,7 @@ def lost_imu_fraction(time_s: Array) -> float:
     return float(lost_count / (lost_count + len(time_s)))
 
 
-def _missing_imu(time_s: Array) -> Unavailable | None:
+def _explain_missing_imu(time_s: Array) -> Unavailable | None:
     median_interval_s = float(np.median(np.diff(time_s)))
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -435,9 +435,9 @@ def read_gnss(
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
     # the track has measurement times, from which the replay subtracts the delay again
-    flown_settings = effective_settings(parameters, GNSS_POS)
-    flown_s = flown_settings[GNSS_POS.delay] * 1e-3
-    timestamp_s = position_samples.index.to_numpy() + flown_s
+    logged_settings = effective_settings(parameters, GNSS_POS)
+    logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
+    timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # upper limit (m) of the reported position noise in EKF2 (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = (
@@ -456,7 +456,7 @@ def read_gnss(
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
-        uses_sender_times=track.assumed_delay_s == 0.0 != flown_s,
+        uses_sender_times=track.assumed_delay_s == 0.0 != logged_delay_s,
     )
 
 
@@ -552,7 +552,7 @@ def _logged_decisions(
     if (
         isinstance(innovations, Unavailable)
         or isinstance(horizon_s, Unavailable)
-        or aid_source(aid) not in ekf2.innovation_topics
+        or innovation_topic(aid) not in ekf2.innovation_topics
     ):
         return rejected_flags, is_reset
     delay_s = effective_settings(fusion_record.parameters, aid)[aid.delay] * 1e-3
@@ -570,7 +570,7 @@ def _logged_decisions(
     for begin, end in span_rows.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_reset = np.isnan(rejected_flags)
-    sample_row = same_sample(innovations.index.to_numpy(), measured_s)
+    sample_row = matching_sample_rows(innovations.index.to_numpy(), measured_s)
     sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
@@ -585,9 +585,9 @@ def _logged_decisions(
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
-        rows = np.flatnonzero(is_recent & may_reset)
-        ends_here = np.intersect1d(rows, dead_reckoning_ends)
-        is_reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
+        reset_rows = np.flatnonzero(is_recent & may_reset)
+        ends_here = np.intersect1d(reset_rows, dead_reckoning_ends)
+        is_reset[ends_here[:1] if len(ends_here) else reset_rows[-1:]] = True
     is_fused = np.zeros(len(is_reset), bool)
     is_fused[last_fused_rows[last_fused_rows >= 0]] = True
     rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0
@@ -604,21 +604,23 @@ def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     vision_enabled_steps = ekf2.states.get(EV_POS.name)
     if dead_reckoning_steps is None or vision_enabled_steps is None:
         return np.zeros((0, 2))
-    spans = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
-    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans[:, 0]) > 0.0)
-    return spans
+    spans_s = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
+    spans_s[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans_s[:, 0]) > 0.0)
+    return spans_s
 
 
-def aid_source(aid: Aid) -> str:
+def innovation_topic(aid: Aid) -> str:
     """Return the uORB topic with the innovations of an aiding source."""
     return f"estimator_aid_src_{aid.name}"
 
 
-def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
+def matching_sample_rows(sample_s: Array, measurement_s: Array) -> IntArray:
     """Return the index of the sample at each measurement time; -1 without a sample."""
-    row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
-    row = np.minimum(row, len(sample_s) - 1)
-    return np.where(np.abs(sample_s[row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, row, -1)
+    sample_row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
+    sample_row = np.minimum(sample_row, len(sample_s) - 1)
+    return np.where(
+        np.abs(sample_s[sample_row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, sample_row, -1
+    )
 
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:

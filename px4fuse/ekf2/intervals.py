@@ -95,26 +95,26 @@ class Timing:
 
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
     """Compute the intervals of a segment; the number of events does not depend on ``timing``."""
-    events = _events(inputs, segment, timing)
+    events = _make_events(inputs, segment, timing)
     start_steps = np.append(0, events.end_step[:-1])
     end_steps = events.end_step
     event_count = len(end_steps)
     duration_s = segment.time_s[end_steps] - segment.time_s[start_steps]
     transition = np.tile(np.eye(STATE_COUNT), (event_count, 1, 1))
     correction_input, acceleration_input = np.zeros((2, event_count, STATE_COUNT))
-    effects = _effects(segment, start_steps, end_steps)
+    effects = _interval_effects(segment, start_steps, end_steps)
     transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
     transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]
     correction_input[:, :IMU_STATE_COUNT] = effects[..., CORRECTION_COLUMN]
     acceleration_input[:, :IMU_STATE_COUNT] = effects[..., INPUT_COLUMN]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-    noise_by_interval = _noises(
+    noise_by_interval = _imu_noise_by_interval(
         (end_steps - start_steps).astype(float), duration_s, transition[:, VELOCITY, THETA]
     )
     return Intervals(events, transition, correction_input, acceleration_input, *noise_by_interval)
 
 
-def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
+def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     received = inputs.received
     time_s = segment.time_s
     first_row, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
@@ -131,7 +131,7 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
-    action, can_start = _actions(inputs, segment, measured_s, end_steps, is_usable)
+    action, can_start = _sample_actions(inputs, segment, measured_s, end_steps, is_usable)
     action[np.isin(stamp_s, received.reset_s) & (action == FUSE)] = START
     # in gaps of the position source there are additional events; their number does not depend on
     # the delay
@@ -158,7 +158,7 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     return events.view(np.recarray)
 
 
-def _actions(
+def _sample_actions(
     inputs: Inputs,
     segment: ReplaySegment,
     measured_at_s: Array,
@@ -192,7 +192,7 @@ def _actions(
     return action, can_start
 
 
-def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
+def _interval_effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     """Return the effect of each cause on attitude, velocity and position at the end of an interval.
 
     Shape (E, 9, EFFECT_COLUMN_COUNT), with one column per cause.
@@ -226,20 +226,22 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     return np.concatenate(effects, axis=1)
 
 
-def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
+def _imu_noise_by_interval(
+    step_counts: Array, duration_s: Array, tilt: Array
+) -> tuple[Array, Array]:
     """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
 
     The noise is summed over the prediction steps: a step of length d adds d² to the variance of
     attitude or velocity. The specific force is the mean of the interval. For velocity and position,
     only the leading terms of the gyro noise are used.
     """
-    n = np.maximum(steps, 1.0)[:, None, None]
+    n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
     # effect of the attitude error on the velocity, in one of n equal steps
     m = tilt / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))
+    gyro, accelerometer = np.zeros((2, len(step_counts), IMU_STATE_COUNT, IMU_STATE_COUNT))
     for matrix, rows, columns, block in (
         (gyro, THETA, THETA, n * d**2 * eye),
         (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),

@@ -85,8 +85,8 @@ def fuse_mean(
     sample_mean: EventSamples,
     R: Array,
     gate: Array,
-    rows: slice,
-    bias_rows: slice | None = None,
+    state_rows: slice,
+    bias_state_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
     """Fuse the mean of a sensor's samples at one event in all filter configurations.
 
@@ -99,23 +99,23 @@ def fuse_mean(
         Mean of one event.
     R, gate : ndarray, shape (S,)
         Variance of one sample, and gate in √S.
-    rows : slice
+    state_rows : slice
         State (NED vector) that the sensor measures in the body frame.
-    bias_rows : slice, optional
+    bias_state_rows : slice, optional
         State (body frame) that is added to the measurement.
     """
-    measured_state = x[:, rows]
+    measured_state = x[:, state_rows]
     sample_count = sample_mean.sample_count
     cross_state, cross_theta = (
         (vectors @ CROSS_PRODUCT).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
-    predicted_value = (H[:, :, rows] @ measured_state[:, :, None])[:, :, 0]
-    if bias_rows is not None:
-        H[:, :, bias_rows] = IDENTITY
-        predicted_value += x[:, bias_rows]
+    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
+    predicted_value = (H[:, :, state_rows] @ measured_state[:, :, None])[:, :, 0]
+    if bias_state_rows is not None:
+        H[:, :, bias_state_rows] = IDENTITY
+        predicted_value += x[:, bias_state_rows]
     nu = sample_mean.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)

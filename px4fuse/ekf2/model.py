@@ -26,14 +26,14 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
     run_segment,
-    with_correlation,
+    with_state_correlation,
 )
 from px4fuse.ekf2.heights import MIN_GATE
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, prepare_inputs
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    MAX_COMPARED_REJECTIONS,
+    MAX_COMPARED_REJECTED_FRACTION,
     UPDATE_COLUMNS,
     VELOCITY_UPDATE_COLUMNS,
     Agreement,
@@ -84,7 +84,7 @@ class Model:
     ----------
     intervals : mapping from Timing to tuple of Intervals
         Intervals of each segment that were already computed.
-    flown : Ekf2Replay
+    baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
         Results of the filter configurations that were already run, per segment.
@@ -93,7 +93,7 @@ class Model:
     flight: Flight
     inputs: Inputs
     intervals: Mapping[Timing, tuple[Intervals, ...]]
-    flown: Ekf2Replay
+    baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
 
@@ -132,23 +132,26 @@ def _open_without_aids(
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss_innovations(flight.ekf2))
-    flown_configuration = FilterConfiguration(inputs.settings)
-    timing = flown_configuration.timing(inputs)
+    baseline_configuration = FilterConfiguration(inputs.settings)
+    timing = baseline_configuration.timing(inputs)
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
-    segments = tuple(with_correlation(inputs, segment) for segment in inputs.segments)
+    segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
-    configurations = [flown_configuration]
+    configurations = [baseline_configuration]
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
     runs = run_configurations(inputs, configurations, intervals_by_timing)
-    flown_replay = _make_replay(inputs, runs, flown_configuration, {})
-    agreement = agreement_with_log(flight, flown_replay)
+    baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
+    agreement = agreement_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Model(flight, inputs, intervals_by_timing, flown_replay, agreement, tuple(runs))
+    model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MAX_COMPARED_REJECTIONS and np.isfinite(inputs.received.rejected).any():
+    if (
+        rejected_share > MAX_COMPARED_REJECTED_FRACTION
+        and np.isfinite(inputs.received.rejected).any()
+    ):
         with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(with_decisions, Agreement):
             agreement = with_logged_rejections(agreement, with_decisions)
@@ -161,7 +164,9 @@ def _open_without_aids(
         agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_fields
     )
     return replace(
-        model, flown=structs.replace(flown_replay, agreement=agreement), agreement=agreement
+        model,
+        baseline_replay=structs.replace(baseline_replay, agreement=agreement),
+        agreement=agreement,
     )
 
 
@@ -236,7 +241,7 @@ def replay_settings(
         return ()
     uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
-        excluded_rows = same_sample(inputs.received.stamp_s, excluded_s)
+        excluded_rows = matching_sample_rows(inputs.received.stamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
         rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
         no_reset = np.zeros(len(rejected_flags), dtype=bool)
@@ -262,7 +267,7 @@ def replay_settings(
         updates = replay.updates
         if excluded_s is not None:
             age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
-            excluded_rows = same_sample(updates.index.to_numpy(), excluded_s - age_s)
+            excluded_rows = matching_sample_rows(updates.index.to_numpy(), excluded_s - age_s)
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
             ]
@@ -344,23 +349,23 @@ def run_configurations(
 ) -> list[SegmentRun]:
     """Run filter configurations through every segment; ``computed_intervals`` are reused."""
     timings = [configuration.timing(inputs) for configuration in configurations]
-    runs = []
+    segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
         intervals = {
             timing: by_segment[segment_index] for timing, by_segment in computed_intervals.items()
         }
         for timing in set(timings) - computed_intervals.keys():
             intervals[timing] = make_intervals(inputs, segment, timing)
-        runs.append(
+        segment_runs.append(
             run_segment(inputs, segment, configurations, [intervals[timing] for timing in timings])
         )
-    return runs
+    return segment_runs
 
 
 def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
     index = pd.Index(run.segment.time_s, name="time_s")
-    position = state[:, POSITION] / run.segment.ekf2_metres_per_metre
-    return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
+    position_m = state[:, POSITION] / run.segment.ekf2_metres_per_metre
+    return pd.DataFrame(np.hstack([position_m, state[:, VELOCITY]]), index, Columns.STATE)
 
 
 def _make_replay(

@@ -117,10 +117,10 @@ def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: 
 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
     """Apply a recursive (IIR) filter by solving a banded triangular system (LAPACK dtbtrs)."""
-    count = len(values)
-    driven_values = np.zeros((values.shape[1], count))
-    for delay in np.flatnonzero(numerator[:count]).tolist():
-        driven_values[:, delay:] += numerator[delay] * values[: count - delay].T
-    bands = np.broadcast_to(denominator, (count, len(denominator))).T
+    value_count = len(values)
+    driven_values = np.zeros((values.shape[1], value_count))
+    for delay in np.flatnonzero(numerator[:value_count]).tolist():
+        driven_values[:, delay:] += numerator[delay] * values[: value_count - delay].T
+    bands = np.broadcast_to(denominator, (value_count, len(denominator))).T
     filtered, _ = lapack.dtbtrs(bands, driven_values.T, uplo="L", overwrite_b=1)
     return np.asarray(filtered)

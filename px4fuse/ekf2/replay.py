@@ -22,7 +22,7 @@ from px4fuse.core.record import (
     Span,
 )
 from px4fuse.core.text import count_noun
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, aid_source, replayed_aid, same_sample
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, innovation_topic, matching_sample_rows, replayed_aid
 from px4fuse.ekf2.replay_segments import SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
@@ -63,7 +63,7 @@ VELOCITY_UPDATE_COLUMNS = [
     "velocity_rejected",
 ]
 # Minimum number of logged innovations for a comparison with the EKF2 replay
-MIN_SAMPLES = 20
+MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
@@ -71,7 +71,7 @@ MAX_INNOVATION_AGE_S = 0.5
 SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
-MIN_CORRELATION = 0.95
+MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |S replayed / S logged - 1| (median): below 0.003 with complete logs, above 0.05 with a
 # downsampled source
 MAX_S_DIFFERENCE = 0.05
@@ -82,7 +82,7 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Maximum rejected fraction for a comparison of single innovations; with more rejections, one
 # sample near the gate changes many later innovations
-MAX_COMPARED_REJECTIONS = 0.05
+MAX_COMPARED_REJECTED_FRACTION = 0.05
 # Maximum rejected fraction for a comparison of the published position, which is otherwise mostly
 # integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
@@ -219,16 +219,16 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     @property
     def evaluated_s(self) -> Spans:
         """Spans (s) of the replay, without the first seconds and times with optical flow only."""
-        spans = []
+        evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
             for flow_start, flow_end in self.flow_only_spans_s:
                 if begin < flow_start < end:
-                    spans.append((begin, flow_start))
+                    evaluated_spans_s.append((begin, flow_start))
                     begin = flow_end + SETTLING_S
             if begin < end:
-                spans.append((begin, end))
-        return tuple(spans)
+                evaluated_spans_s.append((begin, end))
+        return tuple(evaluated_spans_s)
 
 
 class _ComparedInnovations(NamedTuple):
@@ -255,7 +255,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "Record vehicle_local_position during the whole flight.",
         )
     aid = replayed_aid(ekf2)
-    is_own_topic = aid_source(aid) in ekf2.innovation_topics
+    is_own_topic = innovation_topic(aid) in ekf2.innovation_topics
     position_agreement = _compare_innovations(
         ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
     )
@@ -277,7 +277,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            f"positions differ by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            f"positions differ by {_format_above(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
@@ -316,10 +316,10 @@ def _compare_innovations(
     # a sample to which EKF2 resets its state is logged with innovation 0
     is_used &= logged.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged, updates = logged[is_used], updates.iloc[matched_updates[is_used]]
-    if len(logged) < MIN_SAMPLES:
+    if len(logged) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
-            f"(at least {MIN_SAMPLES} are needed)"
+            f"(at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
@@ -407,7 +407,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             matched_updates,
             logged_aid_innovations(name, aid_log),
             axes_of(updates),
-            aid_source(AIDS[name]) in aid_log.topics,
+            innovation_topic(AIDS[name]) in aid_log.topics,
         )
         if isinstance(compared, str):
             omitted_aids[name] = compared
@@ -446,12 +446,12 @@ def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable])
     return pd.DataFrame(columns).dropna()
 
 
-def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
+def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
     """Return True for each time inside one of the spans."""
-    times = np.asarray(times_s)
-    is_inside = np.zeros(times.shape, bool)
-    for start, end in spans:
-        is_inside |= (times > start) & (times < end)
+    times_array_s = np.asarray(times_s)
+    is_inside = np.zeros(times_array_s.shape, bool)
+    for start, end in spans_s:
+        is_inside |= (times_array_s > start) & (times_array_s < end)
     return is_inside
 
 
@@ -461,7 +461,7 @@ def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool)
     ``is_own_topic`` is True for estimator_aid_src topics, which contain measurement times.
     """
     if is_own_topic:
-        return same_sample(updates.index.to_numpy(), logged_s)
+        return matching_sample_rows(updates.index.to_numpy(), logged_s)
     fused_at = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at[np.maximum(update_row, 0)]
@@ -473,19 +473,27 @@ def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool)
 
 
 def _axis_agreement(
-    axis: AxisName, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
+    axis: AxisName,
+    logged_innovations: pd.DataFrame,
+    replayed_innovations: pd.DataFrame,
+    ekf2: Ekf2,
+    ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log = (innovations[f"innovation_{axis}_m"].to_numpy() for innovations in (model, log))
+    nu, nu_log = (
+        innovations[f"innovation_{axis}_m"].to_numpy()
+        for innovations in (replayed_innovations, logged_innovations)
+    )
     S, S_log = (
-        innovations[f"innovation_variance_{axis}_m2"].to_numpy() for innovations in (model, log)
+        innovations[f"innovation_variance_{axis}_m2"].to_numpy()
+        for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
     evaluated_state_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, replay.evaluated_s)
+        inside_spans(ekf2.state.index, ekf2_replay.evaluated_s)
     ].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
-    position, velocity = (
-        component_along(replay.published, columns, direction, evaluated_state_s)
+    position_m, velocity_m_s = (
+        component_along(ekf2_replay.published, columns, direction, evaluated_state_s)
         - component_along(ekf2.state, columns, direction, evaluated_state_s)
         for columns in (Columns.POSITION, Columns.VELOCITY)
     )
@@ -497,8 +505,8 @@ def _axis_agreement(
         s_ratio_p95=s_ratio_p95,
         nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
-        position_rms_difference_m=rms(position),
-        velocity_rms_difference_m_s=rms(velocity),
+        position_rms_difference_m=rms(position_m),
+        velocity_rms_difference_m_s=rms(velocity_m_s),
     )
 
 
@@ -550,37 +558,38 @@ def _agreement_verdict(
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
     )
-    if min_correlation >= MIN_CORRELATION:
+    if min_correlation >= MIN_INNOVATION_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
         limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > limit_m:
             return False, (
                 "the innovations agree, but replayed and published positions differ by "
-                f"{_format_beyond(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
+                f"{_format_above(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
         return True, f"{correlation_text}"
-    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTIONS:
-        return False, f"{correlation_text}, below the minimum of {MIN_CORRELATION:g}"
+    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTED_FRACTION:
+        return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
     rejected_difference = abs(rejected_in_replay - rejected_in_log)
     nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
-    text = (
+    tolerance_text = (
         f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
         f"the mean NIS differs by {nis_difference:.0%}"
     )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis_difference > MAX_NIS_DIFFERENCE:
         return False, (
-            f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
+            f"{tolerance_text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
     return (
         True,
-        f"{text}; single innovations are not compared, because rejections change later ones",
+        f"{tolerance_text}; single innovations are not compared, because rejections change later "
+        "ones",
     )
 
 
-def _format_beyond(value: float, limit: float) -> str:
+def _format_above(value: float, limit: float) -> str:
     """Format a value with at least two decimals, so that it is visibly above the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 

@@ -314,33 +314,33 @@ def find_replay_segments(
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cut_times_s += [change.time_s for change in parameter_changes]
     segments = []
-    for low, high in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
-        fused_inside = fused_s[(fused_s >= low) & (fused_s <= high)]
+    for low_s, high_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
+        fused_inside = fused_s[(fused_s >= low_s) & (fused_s <= high_s)]
         if not len(fused_inside):
             continue
         # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
         # the segment
         earliest_starts_s = [
-            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high
+            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high_s
         ]
-        if field_span and low <= field_span[0] < high:
+        if field_span and low_s <= field_span[0] < high_s:
             earliest_starts_s.append(field_span[0])
         start_row = int(
             np.searchsorted(
                 state_times_s, max([fused_inside[0] + MIN_FUSION_S, *earliest_starts_s])
             )
         )
-        if start_row == len(state_times_s) or high - state_times_s[start_row] < MIN_SEGMENT_S:
+        if start_row == len(state_times_s) or high_s - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high)
+        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high_s)
         if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
             continue
         segment_inputs = imu, attitude, ekf2, fusion_record
         changed = {
-            change.name: change.after for change in parameter_changes if change.time_s <= low
+            change.name: change.after for change in parameter_changes if change.time_s <= low_s
         }
         make_segment = _make_gnss_segment if is_gnss else _make_segment
-        segment = make_segment(*segment_inputs, start_row, high)
+        segment = make_segment(*segment_inputs, start_row, high_s)
         history_row = int(
             np.searchsorted(
                 state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
@@ -349,7 +349,7 @@ def find_replay_segments(
         if history_row < start_row:
             history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
-        if field_span and field_span[0] <= state_times_s[start_row] and high <= field_span[1]:
+        if field_span and field_span[0] <= state_times_s[start_row] and high_s <= field_span[1]:
             segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed=changed))
     return tuple(segments)
@@ -393,9 +393,9 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     if "clipped" in imu:
         imu_s = imu.index.to_numpy()
         clipped_s = imu_s[imu["clipped"].to_numpy() > 0.0]
-        begin, end = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
+        begin_rows, end_rows = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
         clipped_moments = clipped_s[
-            end - begin > MAX_CLIPPED_FRACTION / float(np.median(np.diff(imu_s)))
+            end_rows - begin_rows > MAX_CLIPPED_FRACTION / float(np.median(np.diff(imu_s)))
         ]
         break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return break_times_s
@@ -652,8 +652,8 @@ def predict_s(fusion_record: FusionRecord) -> float:
     return fusion_record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
-def _interpolate(series: pd.Series, times: Array) -> Array:
-    return np.asarray(np.interp(times, series.index, series))
+def _interpolate(series: pd.Series, times_s: Array) -> Array:
+    return np.asarray(np.interp(times_s, series.index, series))
 
 
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:

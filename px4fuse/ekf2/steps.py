@@ -166,12 +166,15 @@ def explain_by_steps(
     assert isinstance(ekf2, Ekf2)
     configurations = step_configurations(model.inputs, settings or Settings())
     delayed_positions = delayed_tracks(model, list(configurations.values()))
-    flown_replay = replay_with_logged_rejections(model)
-    evaluated_spans = model.flown.evaluated_s
+    baseline_replay = replay_with_logged_rejections(model)
+    evaluated_spans = model.baseline_replay.evaluated_s
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = inside_spans(state_times_s, evaluated_spans)
     # compare only at times that the replay and all KF runs cover
-    for index in (flown_replay.delayed.index, *(run.steps.index for run in (runs or {}).values())):
+    for index in (
+        baseline_replay.delayed.index,
+        *(run.steps.index for run in (runs or {}).values()),
+    ):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
     state_times_s = state_times_s[is_inside]
     if not len(state_times_s):
@@ -185,7 +188,7 @@ def explain_by_steps(
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
     stage_names = []
     # tracks are computed one at a time, to limit memory
-    tracks = chain(delayed_positions, (flown_replay.published, ekf2.state))
+    tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stage_names.append(
             [
@@ -200,7 +203,7 @@ def explain_by_steps(
             without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(
-        flown_replay, without_gate, state_span_s, evaluated_spans
+        baseline_replay, without_gate, state_span_s, evaluated_spans
     )
     truth = model.flight.truth
     steps_by_axis = {}
@@ -259,13 +262,13 @@ def explain_by_steps(
 
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
     """Return the filter configuration after each replacement but the output predictor."""
-    flown_settings = inputs.settings
+    logged_settings = inputs.settings
     aid = inputs.aid
     acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.step_s)
-    kf_process_noise = {**flown_settings, "EKF2_ACC_NOISE": acceleration_noise}
+    kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # the delay is already subtracted from the timestamps of GNSS positions
-    applied_delay_s = flown_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
+    applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = modelled_aids(inputs)
@@ -283,13 +286,18 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
         SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
         TIMESTAMPS: kf_configuration,
         NOISE: (
-            noise := replace(kf_configuration, settings=kf_process_noise, uses_reported_noise=True)
+            noise_configuration := replace(
+                kf_configuration, settings=kf_process_noise, uses_reported_noise=True
+            )
         ),
-        BIASES: replace(noise, estimates_biases=True),
-        PROCESS: replace(noise, settings=flown_settings, estimates_biases=True),
+        BIASES: replace(noise_configuration, estimates_biases=True),
+        PROCESS: replace(noise_configuration, settings=logged_settings, estimates_biases=True),
         ATTITUDE: (
             configuration := replace(
-                noise, settings=flown_settings, estimates_biases=True, estimates_attitude=True
+                noise_configuration,
+                settings=logged_settings,
+                estimates_biases=True,
+                estimates_attitude=True,
             )
         ),
     }
@@ -304,13 +312,13 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
         configurations[step] = configuration = replace(
             configuration, without=dict.fromkeys(other_aids[insertion_index:], 0.0)
         )
-    return configurations | {GATE: FilterConfiguration(flown_settings, uses_logged_decisions=True)}
+    return configurations | {GATE: FilterConfiguration(logged_settings, uses_logged_decisions=True)}
 
 
 def _longest_rejection(
-    flown_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans: Spans
+    baseline_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
-    updates = flown_replay.updates[inside_spans(flown_replay.updates.index, spans)]
+    updates = baseline_replay.updates[inside_spans(baseline_replay.updates.index, spans_s)]
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fused_at_s = updates["fused_at_s"].to_numpy()
@@ -323,7 +331,7 @@ def _longest_rejection(
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fused_at_s[run_starts[longest_index]]
     end_s = fused_at_s[min(run_ends[longest_index], len(fused_at_s) - 1)]
-    with_gate = flown_replay.delayed.loc[begin_s:end_s]
+    with_gate = baseline_replay.delayed.loc[begin_s:end_s]
     position_difference = [
         with_gate[column] - np.interp(with_gate.index, without_gate.index, without_gate[column])
         for column in Columns.POSITION[:2]

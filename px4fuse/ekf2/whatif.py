@@ -1,6 +1,6 @@
 """Comparison of EKF2 as logged, replayed, and replayed with other parameters.
 
-All columns of this what-if table are evaluated over the same times.
+All columns of this parameter table are evaluated over the same times.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
-ANALYSIS_NAME = "EKF2 what-if"
+ANALYSIS_NAME = "EKF2 replay with other parameters"
 # Minimum fraction of the replayed innovations in the log for a logged time between fusions
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
@@ -70,7 +70,7 @@ MAX_SWEEP_VALUES = 200
 # Position noise (m) that is added in repeated replays
 ADDED_NOISE_M = 0.002
 # Number of repeated replays with added position noise
-ADDED_NOISE_RUNS = 4
+NOISY_REPLAY_COUNT = 4
 # Minimum rejected fraction of a replay that is repeated with added position noise
 MIN_REJECTED_FRACTION = 0.02
 # Maximum rejected fraction of a replay with predictable statistics
@@ -87,7 +87,7 @@ MAX_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record, frozen=True):
-    """EKF2 statistics along one axis in one column of the what-if table.
+    """EKF2 statistics along one axis in one column of the parameter table.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
     """
@@ -116,7 +116,7 @@ class HeightSummary(Record, frozen=True):
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """EKF2 statistics in one column of the what-if table: logged, replayed, or changed.
+    """EKF2 statistics in one column of the parameter table: logged, replayed, or changed.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ def what_if(
     without = without or {}
     replays = replay_settings(model, settings, without=without)
     flight = model.flight
-    evaluated_s = model.flown.evaluated_s
+    evaluated_s = model.baseline_replay.evaluated_s
     if without:
         disabled_s = min(without.values())
         # later segments start from logged states, which the source affected
@@ -234,14 +234,14 @@ def what_if(
         if not evaluated_s:
             raise SettingsError(
                 f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
-                "earlier time."
+                f"flight, which ends at {model.baseline_replay.evaluated_s[-1][1]:.0f} s. "
+                "Choose an earlier time."
             )
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_summarise_log(flight, model.flown, evaluated_s),
-        replayed=_summarise_replay(flight, model.flown, evaluated_s),
+        logged=_summarise_log(flight, model.baseline_replay, evaluated_s),
+        replayed=_summarise_replay(flight, model.baseline_replay, evaluated_s),
         whatif=_mark_unpredictable(
             model,
             [_summarise_replay(flight, r, evaluated_s) for r in replays],
@@ -299,9 +299,9 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
         raise SettingsError(
             f"{count} parameter values for a sweep: give a number from 2 to {MAX_SWEEP_VALUES}."
         )
-    values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
-    values[[0, -1]] = low, high
-    return [float(value) for value in values]
+    sweep = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
+    sweep[[0, -1]] = low, high
+    return [float(value) for value in sweep]
 
 
 def _mark_unpredictable(
@@ -315,10 +315,10 @@ def _mark_unpredictable(
         if repeated_runs[0].changed
         and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
-    for seed in range(ADDED_NOISE_RUNS if changes else 0):
+    uncertain_changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
+    for seed in range(NOISY_REPLAY_COUNT if uncertain_changes else 0):
         noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
-        replays = replay_settings(noisy_model, changes, without=without)
+        replays = replay_settings(noisy_model, uncertain_changes, without=without)
         for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
             repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     marked_summaries = []
@@ -347,7 +347,7 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
     nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
     return (
-        all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis_by_axis)
+        all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
         and (not rmse_values or max(rmse_values) <= MAX_RMSE_RATIO * min(rmse_values))
     )
@@ -459,7 +459,7 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """Compute one column of the what-if table; ``more`` are further fields of :class:`Summary`.
+    """Compute one column of the parameter table; ``more`` are further fields of :class:`Summary`.
 
     Without ``variance``, the logged position variance is used.
     """
@@ -557,7 +557,7 @@ def _deviation_note(
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = (
-        replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
+        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION]
     )
     position_difference_m = position_difference_m[
         inside_spans(position_difference_m.index, evaluated_s)
@@ -565,7 +565,7 @@ def _deviation_note(
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
-    height_aids = {*model.flown.other_aid_updates} - {EV_POS.name}
+    height_aids = {*model.baseline_replay.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     height_note = (
         f". The published height differs by at most {down_difference_m.max():.3g} m"
@@ -604,4 +604,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
 
 
 def _change_text(replay: Ekf2Replay) -> str:
-    return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"
+    return (
+        ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        or "Logged parameters"
+    )

@@ -33,9 +33,9 @@ SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
 # Maximum number of L-BFGS-B iterations for the final noises
-MAX_ITERATIONS = 50
+MAX_FINAL_ITERATIONS = 50
 # Maximum number of L-BFGS-B iterations while the outlier probabilities still change
-COARSE_MAX_ITERATIONS = 3
+MAX_COARSE_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
 # Initial value of the fraction of outliers
@@ -166,12 +166,12 @@ def _barycentric_signs(node_count: int) -> Array:
     return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
 
 
-def _interpolation_weights(position: float, node_count: int) -> Array:
+def _interpolation_weights(node_position: float, node_count: int) -> Array:
     """Return the weights of the values at 0, 1, ... for barycentric interpolation at a position.
 
     Berrut and Trefethen (2004).
     """
-    node_distances = position - np.arange(node_count)
+    node_distances = node_position - np.arange(node_count)
     if not node_distances.all():
         return np.asarray(node_distances == 0.0, dtype=np.float64)
     weights = _barycentric_signs(node_count) / node_distances
@@ -182,7 +182,7 @@ def fit_ratios(
     position_batches: Iterable[Positions],
     ratios: Sequence[float],
     random_walk: float,
-    weight: Array,
+    measurement_weights: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
     """Fit positions for several ratios SIGMA_A / SIGMA_Z (1/s²), in units of SIGMA_Z.
@@ -191,7 +191,8 @@ def fit_ratios(
     random walk of the source / SIGMA_Z, per √s.
     """
     scaled_batches = (
-        positions.in_sigma_z_units(sigma_z_m, random_walk, weight) for positions in position_batches
+        positions.in_sigma_z_units(sigma_z_m, random_walk, measurement_weights)
+        for positions in position_batches
     )
     fits_by_batch = [
         [fit_positions(scaled_positions, ratio, variance_m2) for ratio in ratios]
@@ -206,7 +207,7 @@ def fit_ratios(
 
 
 def fit_noises(
-    position_batches: Iterable[Positions], noises: Noises, weight: Array
+    position_batches: Iterable[Positions], noises: Noises, measurement_weights: Array
 ) -> FittedPositions:
     """Fit positions with one set of noises; the variance of a measurement is SIGMA_Z² / weight."""
     sigma_z_m = noises.sigma_z_m
@@ -216,18 +217,25 @@ def fit_noises(
             for positions in position_batches
         )
     sigma_ratio = noises.sigma_a_m_s2 / sigma_z_m
-    (fit,) = fit_ratios(
-        position_batches, [sigma_ratio], noises.random_walk_m / sigma_z_m, weight, sigma_z_m
+    (fitted_positions,) = fit_ratios(
+        position_batches,
+        [sigma_ratio],
+        noises.random_walk_m / sigma_z_m,
+        measurement_weights,
+        sigma_z_m,
     )
-    return fit.scaled(sigma_z_m)
+    return fitted_positions.scaled(sigma_z_m)
 
 
 def negative_log_likelihood(
-    axis_positions: Sequence[Positions], noises: Noises, weight: Array
+    axis_positions: Sequence[Positions], noises: Noises, measurement_weights: Array
 ) -> float:
     """Return -ln p of the measurements of all axes, without a constant."""
     return float(
-        sum(fit_noises([positions], noises, weight).scores()[0, 0] for positions in axis_positions)
+        sum(
+            fit_noises([positions], noises, measurement_weights).scores()[0, 0]
+            for positions in axis_positions
+        )
     )
 
 
@@ -286,7 +294,10 @@ def filter_positions(intervals: Preintegrated) -> Positions:
 
 
 def maximise_likelihood(
-    axis_positions: Sequence[Positions], start: Noises, weight: Array, fits_outliers: bool = True
+    axis_positions: Sequence[Positions],
+    start_noises: Noises,
+    weight: Array,
+    fits_outliers: bool = True,
 ) -> NoiseFit:
     """Estimate the noises and, if ``fits_outliers`` is True, the outliers by maximum likelihood.
 
@@ -294,7 +305,7 @@ def maximise_likelihood(
     ----------
     axis_positions : sequence of Positions
         Axes of the same measurements.
-    start : Noises
+    start_noises : Noises
         Initial values. Random walk and time-correlated noise are only fitted if not zero.
     weight : ndarray, shape (m,)
         Initial weight of each measurement.
@@ -304,11 +315,11 @@ def maximise_likelihood(
     outlier_probability = np.zeros_like(weight)
     outlier_share = START_OUTLIER_FRACTION
     outlier_width = START_OUTLIER_WIDTH
-    noises = start
+    noises = start_noises
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
-        likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
+        likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
-            likelihood, noises, COARSE_MAX_ITERATIONS if iteration else MAX_ITERATIONS
+            likelihood, noises, MAX_COARSE_ITERATIONS if iteration else MAX_FINAL_ITERATIONS
         )
         expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
         # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
@@ -343,7 +354,7 @@ def maximise_likelihood(
         if probability_change.max() < MAX_PROBABILITY_CHANGE:
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(sigma_z_variance_m2)))
-    likelihood = Likelihood(axis_positions, weight, start.sigma_z_m)
+    likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m)
     noises = _maximise_by_gradient(likelihood, noises)
     sigma_z_variance_factor = 1.0
     if outlier_probability.any():
@@ -358,19 +369,19 @@ def maximise_likelihood(
 
 
 def _expected_squares_of_axes(
-    axis_positions: Sequence[Positions], noises: Noises, weight: Array
+    axis_positions: Sequence[Positions], noises: Noises, measurement_weights: Array
 ) -> tuple[Array, Array]:
     """Return the expected squared error (m²) and the number of axes of each measurement."""
     squares_and_counts = []
     for positions in axis_positions:
-        constants = fit_noises([positions], noises, weight).constants()[:, 0]
+        constants = fit_noises([positions], noises, measurement_weights).constants()[:, 0]
         scaled_positions, scaled_variance = positions.in_sigma_z_units(
-            1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
+            1.0, noises.random_walk_m, measurement_weights / noises.sigma_z_m**2
         )
         squares_and_counts.append(
             expected_squares(scaled_positions, noises.sigma_a_m_s2, scaled_variance, constants)
         )
-    squares_m2, axis_counts = np.sum(squares_and_counts, axis=0)[:, -len(weight) :]
+    squares_m2, axis_counts = np.sum(squares_and_counts, axis=0)[:, -len(measurement_weights) :]
     return squares_m2, axis_counts
 
 
@@ -414,29 +425,29 @@ def outlier_variance_factor(
 
 
 def _maximise_by_gradient(
-    likelihood: Likelihood, start: Noises, max_steps: int = MAX_ITERATIONS
+    likelihood: Likelihood, start_noises: Noises, max_steps: int = MAX_FINAL_ITERATIONS
 ) -> Noises:
-    values = {name: value for name, value in vars(start).items() if value}
-    log_bounds = np.log([SEARCH_RANGES[name] for name in values])
-    count = len(likelihood.weight)
+    nonzero_noises = {name: value for name, value in vars(start_noises).items() if value}
+    log_bounds = np.log([SEARCH_RANGES[name] for name in nonzero_noises])
+    measurement_count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
         # divided by the number of measurements, the gradient and the first step are about 1
         try:
-            return likelihood(to_noises(logs)) / count
+            return likelihood(to_noises(logs)) / measurement_count
         # far from the maximum rounding errors dominate; the large value makes L-BFGS-B shorten the
         # step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 
     def to_noises(logs: Array) -> Noises:
-        return Noises(**dict(zip(values, np.exp(logs).tolist(), strict=True)))
+        return Noises(**dict(zip(nonzero_noises, np.exp(logs).tolist(), strict=True)))
 
-    result = minimize(
+    minimum = minimize(
         score_per_measurement,
-        np.clip(np.log([*values.values()]), *log_bounds.T),
+        np.clip(np.log([*nonzero_noises.values()]), *log_bounds.T),
         method="L-BFGS-B",
         bounds=log_bounds.tolist(),
         options={"eps": DERIVATIVE_LOG_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
     )
-    return to_noises(result.x)
+    return to_noises(minimum.x)

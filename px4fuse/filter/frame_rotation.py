@@ -38,7 +38,7 @@ POSITION_PART_S = 15.0
 # Minimum length (s) of a flight part whose heading error is estimated from positions
 MIN_POSITION_PART_S = 5.0
 # Minimum number of flight parts for a heading error from orientations
-MIN_PARTS = 3
+MIN_FLIGHT_PARTS = 3
 # Minimum number of positions for an estimate of the heading error
 MIN_MEASUREMENTS = 50
 # Minimum number of orientation samples in a flight part
@@ -58,11 +58,11 @@ MAX_ATTITUDE_INTERVAL_S = 0.11
 # Maximum number of linearisations in the fit of the heading error
 MAX_LINEARISATIONS = 5
 # Maximum change (rad) of the heading error in the last iteration of the linearised fit
-MAX_FINAL_STEP_RAD = 0.01
+MAX_CONVERGED_CHANGE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
-MIN_SCALE = 0.1
+MIN_POSITION_SCALE = 0.1
 # Index of the heading error among the unknown constants of a flight part
 HEADING_ERROR_INDEX = 2
 
@@ -196,13 +196,13 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
     rows_of_parts = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
         HeadingPart(
-            start_s=float(time_s[rows[0]]),
-            end_s=float(time_s[rows[-1]]),
-            heading_error_deg=float(np.degrees(rotation_rad[rows].mean())),
-            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[rows] ** 2)))),
+            start_s=float(time_s[part_rows[0]]),
+            end_s=float(time_s[part_rows[-1]]),
+            heading_error_deg=float(np.degrees(rotation_rad[part_rows].mean())),
+            sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
-        for rows in rows_of_parts
-        if len(rows) >= MIN_PART_SAMPLES
+        for part_rows in rows_of_parts
+        if len(part_rows) >= MIN_PART_SAMPLES
     )
 
 
@@ -218,7 +218,7 @@ def _compare_orientations(
     time_s = orientation_samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
     is_covered = (time_s >= attitude_s[0]) & (time_s <= attitude_s[-1])
-    if np.count_nonzero(is_covered) < MIN_PARTS * MIN_PART_SAMPLES:
+    if np.count_nonzero(is_covered) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
     source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
@@ -226,7 +226,7 @@ def _compare_orientations(
     rotation_rad = source_yaw_rad - yaw_rad
     rotation_rad -= 2.0 * np.pi * np.round(np.median(rotation_rad) / (2.0 * np.pi))
     is_calm = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
-    if np.count_nonzero(is_calm) < MIN_PARTS * MIN_PART_SAMPLES:
+    if np.count_nonzero(is_calm) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
     time_s = time_s[is_calm]
     rotation_rad = rotation_rad[is_calm]
@@ -234,7 +234,7 @@ def _compare_orientations(
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
     part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)
-    if len(part_headings) < MIN_PARTS:
+    if len(part_headings) < MIN_FLIGHT_PARTS:
         return None
     angles_deg = np.array([heading_part.heading_error_deg for heading_part in part_headings])
     chi_square = np.sum((angles_deg - angles_deg.mean()) ** 2) / np.degrees(sigma_rad[0]) ** 2
@@ -290,18 +290,18 @@ def _estimate_from_positions(
         noises = maximise_likelihood(
             [part_positions], noises, motion.weight, fits_outliers=False
         ).noises
-        fit = fit_noises([part_positions], noises, motion.weight)
-        constants = fit.constants()[is_long, 0]
-        constant_covariance = np.linalg.inv(fit.information())[is_long, 0]
+        fitted_positions = fit_noises([part_positions], noises, motion.weight)
+        constants = fitted_positions.constants()[is_long, 0]
+        constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
         # the path has the scale of the positions, which is estimated too
-        position_scale = np.maximum(1.0 + constants[:, -1], MIN_SCALE)
+        position_scale = np.maximum(1.0 + constants[:, -1], MIN_POSITION_SCALE)
         error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance = (
             constant_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
         step_rad, weight_sum = np.average(error_rad, weights=1.0 / heading_variance, returned=True)
         rotation_rad += float(step_rad)
-        if abs(step_rad) < MAX_FINAL_STEP_RAD:
+        if abs(step_rad) < MAX_CONVERGED_CHANGE_RAD:
             break
     difference_rad = error_rad - step_rad
     # variance of the true heading error: variance of the estimates minus that of their errors

@@ -48,7 +48,7 @@ MAX_KNOTS = 40
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
 # Tested factors on KF's SIGMA_A: fitted biases and tilt reduce the acceleration noise
-SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
+TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
@@ -164,9 +164,9 @@ def fit_systematic_errors(
     if isinstance(design, Unavailable):
         return design
     is_skipped = np.isin(axes[0].measurement_time_s[-len(design.time_s) :], outlier_time_s)
-    if (count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
-        return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
-    sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
+    if (used_count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
+        return too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
+    sigma_a_grid = sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS
     sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
     jumps, is_skipped = _find_jumps(
         design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in announced_s]

@@ -202,7 +202,9 @@ class PreparedMotion:
             coarse_motion.weight,
             sigma_z_m,
         )
-        minus_log_likelihood = np.stack([fit.scaled(sigma_z_m).scores()[0] for fit in ratio_fits])
+        minus_log_likelihood = np.stack(
+            [ratio_fit.scaled(sigma_z_m).scores()[0] for ratio_fit in ratio_fits]
+        )
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
         )
@@ -247,9 +249,9 @@ def prepare_motion(
     imu_s = imu.index.to_numpy()
     attitude_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
-    for begin, end in _covered_spans(imu_s, attitude_s):
+    for begin_s, end_s in _covered_spans(imu_s, attitude_s):
         covered_rows = np.flatnonzero(
-            (time_s >= begin + MAX_OFFSET_S) & (time_s <= end - MAX_OFFSET_S)
+            (time_s >= begin_s + MAX_OFFSET_S) & (time_s <= end_s - MAX_OFFSET_S)
         )
         if not len(covered_rows):
             continue

@@ -96,8 +96,10 @@ def replay(
         ],
     )
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
-    time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
-    steps = pd.DataFrame(states, index=time, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
+    step_times_s, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
+    steps = pd.DataFrame(
+        states, index=step_times_s, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS
+    )
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
     update_table = pd.DataFrame(updates, update_index, UPDATE_COLUMNS)
@@ -194,9 +196,9 @@ def state_at(run: Replay, times_s: Array) -> Array:
 
     Interpolation would use a measurement before it is received. NaN outside the run.
     """
-    index, elapsed_s, is_outside = _step_before(run, times_s)
+    step_index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
-        run.steps[column].to_numpy()[index]
+        run.steps[column].to_numpy()[step_index]
         for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
     )
     state = model.propagate_state(position, velocity, acceleration, elapsed_s)
@@ -205,9 +207,9 @@ def state_at(run: Replay, times_s: Array) -> Array:
 
 def variance_at(run: Replay, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
-    index, elapsed_s, is_outside = _step_before(run, times_s)
-    p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[index].T
-    gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]
+    step_index, elapsed_s, is_outside = _step_before(run, times_s)
+    p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
+    gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
     p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
     q00, _, q11 = model.process_noise_unit(elapsed_s)

@@ -145,7 +145,7 @@ def innovations(
     q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
     p, v = intervals.initial.position_m, intervals.initial.velocity_m_s
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
-    rows = []
+    innovations_and_variances = []
     for dt, dp, dv, noise_unit, noise_fixed, z, skips_update in zip(
         intervals.length_s.tolist(),
         _values_by_measurement(intervals.delta_position_m),
@@ -167,8 +167,8 @@ def innovations(
         (nu, s, _, _), updated_state = update_step(p, v, covariance, z, r)
         if not skips_update:
             p, v, covariance = updated_state
-        rows.append((nu, s))
-    nu, s = map(np.array, zip(*rows, strict=True))
+        innovations_and_variances.append((nu, s))
+    nu, s = map(np.array, zip(*innovations_and_variances, strict=True))
     return nu, s
 
 

@@ -92,16 +92,16 @@ class Positions:
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
     def in_sigma_z_units(
-        self, sigma_z_m: float, random_walk: float, weight: Array
+        self, sigma_z_m: float, random_walk: float, measurement_weights: Array
     ) -> tuple[Positions, Array]:
         """Return the positions with noises in units of SIGMA_Z, and the measurement variances.
 
-        ``random_walk`` is the random walk of the source / SIGMA_Z (1/√s). ``weight`` may omit the
-        first measurement, which is KF's initial state and gets weight 1.
+        ``random_walk`` is the random walk of the source / SIGMA_Z (1/√s). ``measurement_weights``
+        may omit the first measurement, which is KF's initial state and gets weight 1.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
         noise_fixed[0] += self.length_s * random_walk**2
-        start_weights = np.ones(len(self.measurement_m) - len(weight))
+        start_weights = np.ones(len(self.measurement_m) - len(measurement_weights))
         correlated_noise = self.correlated_noise
         if correlated_noise:
             correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
@@ -111,7 +111,7 @@ class Positions:
             prior_precision=self.prior_precision * sigma_z_m**2,
             correlated_noise=correlated_noise,
         )
-        return scaled_positions, 1.0 / np.concatenate([start_weights, weight])
+        return scaled_positions, 1.0 / np.concatenate([start_weights, measurement_weights])
 
     def factorised_equations(
         self, sigma_a_m_s2: float, variance_m2: Array

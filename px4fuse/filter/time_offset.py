@@ -180,14 +180,14 @@ def estimate_time_offset(
             [motion.at(offset_s)], noises, motion.weight, fits_outliers=False
         ).noises
         curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
-        fit = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
-        offset_s, sigma_s = _minimum_and_sigma(curve_s, fit.scores()[0])
+        fitted_positions = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
+        offset_s, sigma_s = _minimum_and_sigma(curve_s, fitted_positions.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
     variance_factor = _simulate_variance_factor(prepared_motion, offset_s, noises, sigma_s**-2.0)
     while True:
         nodes_s, curve_s = (
-            _offset_grid(offset_s, half_width_s, count)
-            for count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
+            _offset_grid(offset_s, half_width_s, offset_count)
+            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
         )
         position_batches = prepared_motion.position_batches(nodes_s)
         node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
@@ -236,9 +236,9 @@ def estimate_time_offset(
     )
 
 
-def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
+def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
     low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
-    return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), count)
+    return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
 
 
 def _simulate_variance_factor(
@@ -277,11 +277,11 @@ def _simulate_variance_factor(
             * np.sqrt(offset_positions.length_s[is_joined])
             * draw_normal(interval_count)
         )
-    offset_positions, variance = offset_positions.in_sigma_z_units(
+    offset_positions, scaled_variance = offset_positions.in_sigma_z_units(
         1.0, noises.random_walk_m, prepared_motion.weight / noises.sigma_z_m**2
     )
     noise_products = products_by_segment(
-        offset_positions, noises.sigma_a_m_s2, variance, (error_m, dp, dv), velocity_noise
+        offset_positions, noises.sigma_a_m_s2, scaled_variance, (error_m, dp, dv), velocity_noise
     )
     return 1.0 + float(np.var(noise_products.sum(axis=0))) / information
 

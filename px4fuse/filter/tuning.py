@@ -277,7 +277,7 @@ def tune_axes(
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     """Estimate SIGMA_A (index 0) or SIGMA_Z (index 1) with its 95 % interval."""
-    values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
+    sigmas = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
         log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
@@ -288,7 +288,7 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     variance_factor = (1.0, fit.sigma_z_variance_factor)[noise_index]
     return _noise_with_interval(
         score,
-        (np.log(values[noise_index]), np.log(values[1 - noise_index])),
+        (np.log(sigmas[noise_index]), np.log(sigmas[1 - noise_index])),
         search_range,
         variance_factor,
     )
@@ -311,13 +311,13 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    value = float(np.exp(best_logs[0]))
+    estimate = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
-        search_range[0] * MAX_SEARCH_END_RATIO < value < search_range[1] / MAX_SEARCH_END_RATIO
+        search_range[0] * MAX_SEARCH_END_RATIO < estimate < search_range[1] / MAX_SEARCH_END_RATIO
     )
     is_closed = low is not None and high is not None
-    return Noise(value if is_inside and is_closed else None, low, high)
+    return Noise(estimate if is_inside and is_closed else None, low, high)
 
 
 def _assess_innovations(

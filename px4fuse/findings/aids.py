@@ -9,7 +9,7 @@ from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
-from px4fuse.ekf2.aids import WINDOW_S, AidResult
+from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
@@ -135,7 +135,7 @@ def detect_in_aids(
                 f"{abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
                 f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
-                ((time_s, time_s + WINDOW_S),),
+                ((time_s, time_s + CHANGE_WINDOW_S),),
             )
         elif aid.verdict == "overconfident" and name != source_aid:
             # no noise value is proposed: innovations alone do not distinguish noise from a wrong

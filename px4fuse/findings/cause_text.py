@@ -9,7 +9,7 @@ from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import (
     Statistic,
     Trial,
-    can_improve,
+    can_show_improvement,
     explained_fraction,
     improvement,
     is_sufficient,
@@ -46,7 +46,7 @@ def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
 def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
     return any(
         (trial.filter, trial.change) == (owner, cause.change)
-        and can_improve(trial)
+        and can_show_improvement(trial)
         and improvement(trial) == "nothing"
         for trial in analysis.main_trials
     )

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
+from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -18,7 +18,7 @@ from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
-    can_improve,
+    can_show_improvement,
     find_cause,
     find_trial,
     find_trials,
@@ -188,11 +188,11 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     if trial := find_trial(analysis.main_trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
-        trial.filter == "kf" and trial.change.keys() == {name} and can_improve(trial)
+        trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
         for trial in analysis.main_trials
     ):
         return NO_IMPROVEMENT
-    value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
+    value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
     return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 

@@ -62,7 +62,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             or _is_effect(item)
             or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
-    elif faults.orientation == "copied" and not faults.of_positions:
+    elif faults.orientation == "copied" and not faults.has_position_fault:
         root_findings = []
     root_findings += [
         item

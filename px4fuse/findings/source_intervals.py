@@ -9,7 +9,7 @@ from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
+from px4fuse.ekf2.aids import MAX_NOT_FUSED_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
@@ -120,7 +120,7 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
         labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
         aiding = f"For {duration_s:.1f} s EKF2 relied on {labels}. "
     return finding(
-        "error" if has_aids and not aids and duration_s > NOT_FUSED_LIMIT_S else "warning",
+        "error" if has_aids and not aids and duration_s > MAX_NOT_FUSED_S else "warning",
         "source_stops" if stops else "source_begins",
         f"{positions_phrase(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
         f"{aiding}KF, RMSE and verdicts do not include this time.",

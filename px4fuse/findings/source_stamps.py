@@ -6,7 +6,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP, STAMP_FAULTS, SYNCHRONISE
+from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP_ACTION, STAMP_FAULTS, SYNCHRONISE_ACTION
 from px4fuse.findings.model import Findings, error, fraction_on, note, warning
 from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
 from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_phrase
@@ -99,7 +99,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
         f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
         f"in microseconds since the autopilot's boot. {effect}px4fuse uses the arrival times, "
         "which are late by the latency.",
-        SYNCHRONISE if is_unix else SET_TIMESTAMP,
+        SYNCHRONISE_ACTION if is_unix else SET_TIMESTAMP_ACTION,
         {"clock": clock},
     )
 

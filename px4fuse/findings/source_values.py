@@ -187,7 +187,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
     if not model.agreement.good or not is_source_fused(analysis, model.inputs):
         return ""
     sizes_m = []
-    for run in (model.flown, *replay_settings(model, [change])):
+    for run in (model.baseline_replay, *replay_settings(model, [change])):
         track = run.published[inside_spans(run.published.index, run.evaluated_s)]
         errors = [
             track[name] - np.interp(track.index, truth.samples.index, truth.samples[name])
