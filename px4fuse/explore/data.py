@@ -9,8 +9,8 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
-from px4fuse.card.model import AXIS_ENDS
-from px4fuse.card.verdicts import verdicts
+from px4fuse.card.model import RATIO_AXIS_ENDS
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
@@ -82,7 +82,7 @@ def ranges() -> Data:
         "dt": SETTING_RANGES["dt_s"][:2],
         "lesson": _settings_data(Settings()),
         "bands": CONSISTENT_RATIOS,
-        "ends": list(AXIS_ENDS),
+        "ends": list(RATIO_AXIS_ENDS),
         "marks": MARK_PATHS,
     }
 
@@ -175,7 +175,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
     return {
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
-        "ratios": [verdict.ratio for verdict in verdicts(result)],
+        "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their noise estimates if they exist

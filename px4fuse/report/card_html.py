@@ -8,13 +8,13 @@ from markupsafe import Markup
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
 from px4fuse.card.model import (
-    AXIS_TICKS,
     FILTER_NAMES,
+    RATIO_AXIS_TICKS,
     Card,
     Verdict,
     axis_fraction,
 )
-from px4fuse.card.verdicts import verdicts
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
@@ -94,7 +94,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
         alternative=alternative_text(all_verdicts),
         ticks=[
             (_percent(tick), label, tick not in LABELLED_TICKS)
-            for tick, label in AXIS_TICKS.items()
+            for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=band_limits(),
         names=FILTER_NAMES,
@@ -107,7 +107,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 def axis_figures(analysis: Analysis) -> str:
     """Return an HTML figure with the four σ ratios of KF and EKF2 for each axis."""
     return "".join(
-        axis_html(verdicts(result), describe_axis(analysis, result), name)
+        axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
-    AXIS_TICKS,
     FILTER_NAMES,
     MAX_NOTES,
+    RATIO_AXIS_TICKS,
     Action,
     AidRow,
     Card,
@@ -340,7 +340,7 @@ def _verdict_line(verdict: Verdict) -> Line:
 def _ticks_line() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_TICKS:
-        label = AXIS_TICKS[tick]
+        label = RATIO_AXIS_TICKS[tick]
         start = min(max(_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
         characters[start : start + len(label)] = label
     return "".join(characters)

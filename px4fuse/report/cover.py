@@ -5,9 +5,9 @@ from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
-    AXIS_ENDS,
-    AXIS_TICKS,
     FILTER_NAMES,
+    RATIO_AXIS_ENDS,
+    RATIO_AXIS_TICKS,
     Action,
     AidRow,
     Card,
@@ -118,14 +118,15 @@ def _shorten_middle(name: str) -> str:
 
 def _axis_data(card: Card) -> dict[str, Any]:
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
-    ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
+    ends = " and ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     axis_text = f", {card.effect.axis}" if card.effect else ""
     return {
         "axis_title": AXIS_TITLE,
         "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
         "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ outside {ends}",
         "ticks": [
-            {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
+            {"fraction": axis_fraction(tick), "label": label}
+            for tick, label in RATIO_AXIS_TICKS.items()
         ],
         "rows": [*map(_verdict_row, card.verdicts), *map(_aid_row, card.aids)],
     }
@@ -176,7 +177,7 @@ def _ratio_marks(
 
 
 def _clipped_place(ratio: float) -> float:
-    return min(max(axis_fraction(max(ratio, AXIS_ENDS[0])), 0.0), 1.0)
+    return min(max(axis_fraction(max(ratio, RATIO_AXIS_ENDS[0])), 0.0), 1.0)
 
 
 def _causes_legend(causes: Sequence[Cause]) -> str:
