@@ -74,7 +74,8 @@ def compare(
         See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m; for GNSS the measurement noise of
         EKF2.
     clock_offset_s : float or "auto", optional
-        Time offset to add to the timestamps of the position source; "auto" estimates it.
+        Time offset to add to the timestamps of the position source; "auto" estimates it. Default:
+        0, or "auto" with ``position``.
     axes : str or sequence of str
         "north", "east", "down" or "aisle"; default: all axes of the position source.
     heading_deg : float, optional
@@ -82,7 +83,7 @@ def compare(
     start_s, end_s : float, optional
         Analysed time span, in seconds after the first data; default: take-off and landing.
     position_source : str, optional
-        Name of the position track for KF.
+        Name of the position track for KF; default: the track with the fewest processing steps.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
         Kind of the position source; default: from its messages.
     height : {"gnss", "barometer"}, optional

@@ -72,7 +72,7 @@ def diagnose(
     flight : Flight, optional
         Flight from the files of the request; without it, the files are read.
     as_sent : bool
-        True to skip the check of axes, unit and clock of the positions.
+        True to skip the check of axes, unit and clock of the positions, as in a quiz.
 
     Raises
     ------
@@ -187,6 +187,7 @@ def prepare_comparison(
     """
     flight = flight or read_flight(request, progress)
     prepared = prepare(flight, request, as_sent=as_sent)
+    # read_flight has already estimated the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared
     _, clock = estimate_noises_and_clock(prepared, progress)
@@ -213,6 +214,7 @@ def rerun(
     """Replay EKF2, explain the difference KF - EKF2, and re-run the filters without each error."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
+    # all parameter sets of this step are replayed together, which is faster than one by one
     model = open_model(
         comparison.flight,
         lambda inputs: [

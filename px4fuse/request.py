@@ -82,34 +82,7 @@ class ComparisonRequest(
 ):
     """Request to compare KF with EKF2: ``px4fuse compare``, ``tune`` or ``sync``.
 
-    Attributes
-    ----------
-    log : str
-        Path of the ULog or MAVLink recording; in results its file name.
-    system : int or None
-        MAVLink system id of the vehicle; None: the id with the most messages.
-    position : PositionFile or None
-        Recording of the positioning system.
-    position_source : str or None
-        Name of the position track for KF; None: the track with the fewest processing steps.
-    source_kind : {"uwb", "vio", "mocap", "gnss"} or None
-        Kind of the position source; None: from its messages.
-    height : {"gnss", "barometer"} or None
-        Height source on a flight with GNSS; None: the source that EKF2 fused, GNSS first.
-    sigma_a_m_s2, dt_s : float
-        See :class:`px4fuse.filter.settings.Settings`.
-    sigma_z_m : float or None
-        KF measurement noise; None: 0.1 m, or for GNSS the measurement noise of EKF2.
-    input : {"imu", "zero"} or None
-        Acceleration for KF; None: from the IMU if it is logged.
-    axes : tuple of str
-        Axes to analyse; empty: all axes with a position.
-    heading_deg : float or None
-        Heading of the axis "aisle", clockwise from north; None: main direction of the track.
-    start_s, end_s : float or None
-        Analysed time span, in seconds after the first data; None: take-off and landing.
-    clock_offset_s : float, "auto" or None
-        Time to add to the timestamps of the position source; None: 0, or "auto" with ``position``.
+    The fields are the arguments of :func:`px4fuse.compare`. In results, paths are file names.
     """
 
     log: str

@@ -62,7 +62,7 @@ def plain_replay(
     drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
     deviation = np.sqrt(segment.variance)
-    P = deviation[:, None] * segment.correlation * deviation
+    P = deviation[:, None] * segment.state_correlation * deviation
     x, k = segment.state.copy(), 0
     R = settings["EKF2_EVP_NOISE"] ** 2
     innovations, variances = [], []

@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
 from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
+from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
@@ -122,7 +122,7 @@ def analysis(
             "ekf2_model",
             "loop",
             "heading",
-            "bias_scale_jump_fit",
+            "systematic_errors",
             "source_low_pass",
             "time_correlated_noise",
         ),
@@ -256,7 +256,7 @@ def late(
     )
 
 
-def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> BiasScaleJumpFit:
+def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> SystematicErrors:
     return made(
-        BiasScaleJumpFit, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0)
+        SystematicErrors, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0)
     )

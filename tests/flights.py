@@ -343,7 +343,7 @@ def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysi
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     missing = unavailable("estimates")
     estimates = Estimates(
-        tuning=tuning or {}, clock=missing, heading=missing, bias_scale_jump_fit=missing,
+        tuning=tuning or {}, clock=missing, heading=missing, systematic_errors=missing,
         source_low_pass=missing, time_correlated_noise=missing,
         tuning_by_axis=tune_by_axis(comparison),
         noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),

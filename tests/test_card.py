@@ -24,7 +24,7 @@ from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 REQUEST = ComparisonRequest(log="a.ulg")
@@ -180,7 +180,7 @@ def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> N
 
 
 def test_card_explains_why_the_two_verdicts_on_ekf2_differ() -> None:
-    flight = simulate_flight(Scenario(seed=8), parse(("ekf2-delay=0.25",)))
+    flight = simulate_flight(Scenario(seed=8), parse_mistakes(("ekf2-delay=0.25",)))
     explained = explain(compare(flight, Settings()))
     card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (

@@ -41,7 +41,7 @@ from px4fuse.filter.imu_motion import (
 )
 from px4fuse.filter.likelihood import profile_interval
 from px4fuse.filter.signals import Segment
-from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset, PartOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, ClockOffset, PartOffset
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.flight.position_source import (
     ALIGNED,
@@ -301,7 +301,7 @@ def test_time_offset_of_flight_parts_maximises_likelihood(monkeypatch, offset_s)
         position_batches=lambda grid: grid,
         weight=None,
     )
-    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1))
+    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), 1.0)
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])
@@ -354,7 +354,7 @@ def test_time_offset_from_insufficient_data_states_reason() -> None:
 
 def test_clock_jump_and_drift_are_found_in_parts_of_a_flight() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
-    assert found.change_p_value < MAX_CHANGE_P
+    assert found.change_p_value < MAX_CHANGE_P_VALUE
     for part in found.parts:
         true_s = -0.25 if part.start_s > 55.0 else 0.0
         if part.end_s < 60.0 or part.start_s > 55.0:
@@ -363,7 +363,7 @@ def test_clock_jump_and_drift_are_found_in_parts_of_a_flight() -> None:
     found = estimate(made_flight(6, duration_s=240.0, drift_ppm=1000.0)[0])
     assert found.drift_ppm == pytest.approx(1000.0, abs=3.0 * found.drift_sigma_ppm)
     assert found.drift_sigma_ppm < 200.0
-    assert found.change_p_value < MAX_CHANGE_P
+    assert found.change_p_value < MAX_CHANGE_P_VALUE
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])

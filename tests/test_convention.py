@@ -28,7 +28,7 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.flight.position_source import RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import from_vector, interpolate, multiply
 
@@ -67,7 +67,7 @@ TOLERANCES = {"rotation_deg": 4.0, "heading_error_deg": 4.0, "late_s": 0.06, "cl
 
 @cache
 def flown(seed: int = 3, *mistakes: str) -> Flight:
-    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse(mistakes))
+    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse_mistakes(mistakes))
 
 
 def sent(

@@ -20,7 +20,7 @@ from px4fuse.ekf2.filter_recursion import (
     _Fusion,
     _limit_bias,
     _sequential_update,
-    _settled_correlation,
+    _settled_state_correlation,
     run_segment,
 )
 from px4fuse.ekf2.filter_recursion import _measurements as measurements
@@ -97,7 +97,8 @@ def deciding(
         rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        rejected=np.array([logged]), reset=np.array([logged_reset]), has_all_resets=False,
+        logged_rejected=np.array([logged]), logged_reset=np.array([logged_reset]),
+        has_all_resets=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
@@ -250,7 +251,7 @@ def test_ekf2_replay_initial_correlation_equals_kalman_filter():
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
     segment.variance[:] = np.diag(P)
-    found = _settled_correlation(segment)
+    found = _settled_state_correlation(segment)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -321,7 +322,7 @@ def at_rest(
         down_m=np.full(count + 1, down_m),
         attitude_variance_rad2=np.tile([tilt_rad2, tilt_rad2, 1e-4], (count + 1, 1)),
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
-        correlation=np.eye(15),
+        state_correlation=np.eye(15),
     )  # fmt: skip
     segment.state[2] = heading_rad
     if field_gauss is not None:

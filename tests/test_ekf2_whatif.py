@@ -40,7 +40,7 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Columns, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 
@@ -223,7 +223,9 @@ def test_what_if_with_late_samples_adds_a_note():
 def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     """Return the model of a simulated flight with one wrong EKF2 parameter, read from its log."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
-    log.write_bytes(to_ulog(simulate(Scenario(seed=seed), parse([mistake] if mistake else []))))
+    log.write_bytes(
+        to_ulog(simulate(Scenario(seed=seed), parse_mistakes([mistake] if mistake else [])))
+    )
     return opened(read_log(log))
 
 

@@ -40,7 +40,7 @@ from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
-from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate
+from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import Noise
@@ -652,7 +652,7 @@ def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
 
 def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
     return TimeCorrelatedNoise(
-        1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag
+        1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, low_pass_gain_nats=lag
     )
 
 
@@ -667,12 +667,12 @@ def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
 
 
 def jumping(*sizes: Any, **parts: Any) -> Any:
-    return analysis(bias_scale_jump_fit=made(BiasScaleJumpFit, jumps=sizes), **parts)
+    return analysis(systematic_errors=made(SystematicErrors, jumps=sizes), **parts)
 
 
 def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any) -> Any:
-    found = made(BiasScaleJumpFit, scale=Estimate(value, sigma), jumps=())
-    usual = {"bias_scale_jump_fit": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
+    found = made(SystematicErrors, scale=Estimate(value, sigma), jumps=())
+    usual = {"systematic_errors": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -708,13 +708,13 @@ def wrong_delay(one: Any) -> Any:
 
 STATED = source_positions.detect_wrong_variance
 SOURCE_EDGES = [
-    *((BIAS, analysis(bias_scale_jump_fit=with_bias(sign * bias, sigma)), expected)
+    *((BIAS, analysis(systematic_errors=with_bias(sign * bias, sigma)), expected)
       for sign in (1.0, -1.0)
       for bias, sigma, expected in (
           (0.2, 0.01, "warning"), (0.199, 0.01, None), (0.3, 0.01, "error"),
           (0.299, 0.01, "warning"), (0.25, 0.0625, "warning"), (0.25, 0.0626, None))),
     # EKF2's bias if the positions give none; horizontally that of the positions is better
-    *((BIAS, analysis(bias_scale_jump_fit=fit, ekf2=bias_of_ekf2(*bias)), expected)
+    *((BIAS, analysis(systematic_errors=fit, ekf2=bias_of_ekf2(*bias)), expected)
       for bias, fit, expected in (
           ((0.2, 0.0, 0.0), NONE, "warning"), ((0.199, 0.0, 0.0), NONE, None),
           ((0.0, 0.0, 0.2), with_bias(0.0), "warning"), ((0.5, 0.5, 0.1), with_bias(0.0), None))),
@@ -822,9 +822,7 @@ SOURCE_EDGES = [
 
 
 def test_accelerometer_bias_finding_states_95_percent_interval() -> None:
-    one = analysis(
-        bias_scale_jump_fit=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0)
-    )
+    one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
     assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message

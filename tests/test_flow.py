@@ -18,7 +18,7 @@ from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 # interval (s) and weight of a new sample in EKF2's low-pass filter, ekf.h
@@ -35,7 +35,7 @@ def low_pass_weights(raw: np.ndarray) -> np.ndarray:
 
 @cache
 def model() -> Model:
-    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse(())))
+    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_mistakes(())))
 
 
 def true_velocity(times: np.ndarray) -> np.ndarray:
@@ -205,7 +205,7 @@ def test_ekf2_replay_start_covariance_uses_data_before_start():
     assert segment.history is not None
     assert segment.history.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
     assert segment.history.time_s[0] < 1.0
-    of_tilt = segment.correlation[:2, 12:15] @ segment.body_to_ned[0].T
+    of_tilt = segment.state_correlation[:2, 12:15] @ segment.body_to_ned[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 

@@ -19,9 +19,9 @@ from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTr
 from px4fuse.classroom.grading.form_points import (
     PART_NAMES,
     POINTS_TABLE,
+    accepted_corrections,
     form_points,
-    panels,
-    right_corrections,
+    panels_showing,
 )
 from px4fuse.cli.simulate import simulate
 from px4fuse.results.answer_form import (
@@ -34,7 +34,7 @@ from px4fuse.results.answer_form import (
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
@@ -93,16 +93,16 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = right_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = accepted_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
-        assert set(panels(name)) > {"cover"}
+        assert set(panels_showing(name)) > {"cover"}
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert form_points(RIGHT, TRUTH).is_kind_named == {"clock-offset": True, "dropout": True}
+    assert form_points(RIGHT, TRUTH).is_named_by_kind == {"clock-offset": True, "dropout": True}
 
 
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
@@ -185,7 +185,9 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
 def test_correct_size_of_open_loop_end_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
-    (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
+    (wrong,) = form_truth(
+        flights.simulate(scenario, parse_mistakes(("open-end=5m",))), SHA256
+    ).mistakes
     assert wrong.size is not None
     assert wrong.low is not None
     assert 0.1 < abs(wrong.size - 5.0) < 1.5
@@ -201,7 +203,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
     scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
-    return flights.simulate(scenario, parse(given["mistake"]))
+    return flights.simulate(scenario, parse_mistakes(given["mistake"]))
 
 
 def answers_of(form: dict[str, Any]) -> Answers:

@@ -40,7 +40,7 @@ from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.report import pdf
 from px4fuse.simulation.flights import answer, simulate
-from px4fuse.simulation.mistakes import MISTAKES, parse
+from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
 from px4fuse.simulation.scenario import KINDS, make_scenario
 
 NOTES = """# What I saw
@@ -196,7 +196,7 @@ def test_session_in_page_on_assistants_has_current_answers(
 def spread(kind: str, *mistakes: str) -> list[str]:
     """Summarise the fields of a simulated flight's topics, and its answer key."""
     size = {} if kind == "outdoor" else {"length_m": 6.0}
-    made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse(mistakes))
+    made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse_mistakes(mistakes))
     return [
         f"{topic.name} {field} {numbers(part)}"
         for topic in made.topics

@@ -16,7 +16,7 @@ from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.estimates import _fit_source_errors, estimate
-from px4fuse.filter.hypotheses import DesignMatrix, fit_bias_scale_jumps, make_design_matrix
+from px4fuse.filter.hypotheses import DesignMatrix, fit_systematic_errors, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -26,7 +26,7 @@ from px4fuse.findings import source_positions as sent
 from px4fuse.findings import source_stamps as stamps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
@@ -53,7 +53,7 @@ def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analy
 @cache
 def flight(*mistakes: str, passes: int = 4) -> Flight:
     size = Scenario(ekf2=False, truth=False, seed=3, passes=passes)
-    return simulate_flight(size, parse(mistakes))
+    return simulate_flight(size, parse_mistakes(mistakes))
 
 
 @cache
@@ -140,7 +140,7 @@ def test_bias_regression_equals_least_squares_with_prior() -> None:
 
 
 def test_clean_flight_has_no_bias_scale_error_or_jump() -> None:
-    causes, low_pass = flown().bias_scale_jump_fit, flown().source_low_pass
+    causes, low_pass = flown().systematic_errors, flown().source_low_pass
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
     assert causes.sigma_a_m_s2 == pytest.approx(0.2, rel=0.35)  # the white noise alone
@@ -208,7 +208,7 @@ def test_scale_factor_estimate_is_not_biased_by_imu_noise() -> None:
     for seed in range(5):
         flown = simulate_flight(Scenario(ekf2=False, truth=False, seed=seed))
         comparison = compare(flown, RIGHT, axes=("north", "east"))
-        found = fit_bias_scale_jumps(
+        found = fit_systematic_errors(
             comparison.flight, tuple(result.axis for result in comparison.axes.values()), RIGHT,
             sigma_a_m_s2=0.2, sigma_z_m=0.1, outlier_time_s=np.array([]), clock_offset_s=0.0,
         )  # fmt: skip
@@ -219,7 +219,7 @@ def test_scale_factor_estimate_is_not_biased_by_imu_noise() -> None:
 def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert set(found(flown("nlos=5%"))) == {"source_outliers"}
     assert "source_outliers" not in found(flown("jump=1,40s"))
-    causes = flown("jump=1,40s").bias_scale_jump_fit
+    causes = flown("jump=1,40s").systematic_errors
     (jump,) = causes.jumps
     assert jump.time_s == pytest.approx(40.0, abs=0.5)
     heading = np.degrees(np.arctan2(jump.step_m[1].value, jump.step_m[0].value))
@@ -238,7 +238,9 @@ def test_time_offset_is_not_reported_as_low_pass() -> None:
 
 @cache
 def with_ekf2(*mistakes: str) -> Analysis:
-    return unexplained(compare(simulate_flight(Scenario(seed=3), parse(mistakes)), axes=("north",)))
+    return unexplained(
+        compare(simulate_flight(Scenario(seed=3), parse_mistakes(mistakes)), axes=("north",))
+    )
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
@@ -280,7 +282,7 @@ def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
     assert isinstance(fit, Unavailable)
     assert isinstance(low_pass, Unavailable)
     untuned = replace(
-        tuned, tuning={}, bias_scale_jump_fit=fit, source_low_pass=low_pass,
+        tuned, tuning={}, systematic_errors=fit, source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
     )  # fmt: skip
     assert found(untuned) == {}
@@ -290,5 +292,5 @@ def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
 def test_very_short_flight_gives_no_bias_or_jump_finding(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
-    assert isinstance(short.bias_scale_jump_fit, Unavailable)
+    assert isinstance(short.systematic_errors, Unavailable)
     assert isinstance(short.source_low_pass, Unavailable)

@@ -473,7 +473,7 @@ def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width)
 def test_maximum_likelihood_without_outlier_model_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
-    found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)
+    found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, fits_outliers=False)
     np.testing.assert_array_equal(found.weight, weight)
     assert not found.outlier_probability.any()
     best = negative_log_likelihood(parts, found.noises, weight)

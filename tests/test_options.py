@@ -78,5 +78,5 @@ def test_each_field_of_analysis_request_changes_the_results(name: str) -> None:
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
-    with pytest.raises(ValueError, match="ORIGINS has no kind and path"):
+    with pytest.raises(ValueError, match="no kind and path"):
         find_origin("lidar", "as received")

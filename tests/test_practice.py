@@ -30,7 +30,7 @@ from px4fuse.explore.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, dr
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 # A set without a fault, with one of the source, and with one of the frame
@@ -79,7 +79,7 @@ def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
         sigma_uwb_m=float(size) if noisy else 0.1,
     )
     options = [] if mistake is None or noisy else [f"{mistake.mistake}={size}"]
-    return simulate_flight(scenario, parse(options))
+    return simulate_flight(scenario, parse_mistakes(options))
 
 
 def compared(flight: Flight, **settings: float) -> Comparison:

@@ -18,7 +18,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 AXES = ("north", "east", "down")
@@ -30,7 +30,9 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
-    return explain(compare(simulate_flight(scenario, parse(mistakes)), settings, axes=AXES))
+    return explain(
+        compare(simulate_flight(scenario, parse_mistakes(mistakes)), settings, axes=AXES)
+    )
 
 
 def errors_m(comparison: Comparison) -> float:

@@ -23,9 +23,15 @@ from px4fuse.findings import find
 from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
-from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake, parse
+from px4fuse.simulation.mistakes import (
+    MISTAKES,
+    Mistakes,
+    active_mistake_names,
+    format_mistake,
+    parse_mistakes,
+)
 from px4fuse.simulation.motion import attitude, direction, plan
-from px4fuse.simulation.scenario import DT_S, Scenario, quantities
+from px4fuse.simulation.scenario import DT_S, Scenario, bounds_by_field
 
 NO_MISTAKES = Mistakes()
 AISLE = Scenario(passes=2, seed=4)
@@ -41,7 +47,7 @@ IDEAL = {
 
 def test_mistake_sizes_all_have_limits() -> None:
     numbers = {item.name for item in fields(Mistakes) if "float" in str(item.type)}
-    assert set(quantities(Mistakes)) == numbers
+    assert set(bounds_by_field(Mistakes)) == numbers
 
 
 def motion_of(scenario, mistakes=NO_MISTAKES):
@@ -105,7 +111,7 @@ class TestMotion:
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
 def test_simulated_loop_with_open_end_has_given_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
-    flown = simulate(scenario, parse(texts))
+    flown = simulate(scenario, parse_mistakes(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
     # the last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
@@ -134,7 +140,7 @@ def test_simulated_aisle_flight_has_given_length_and_yaw_mode(yaw):
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
 def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
-    simulation = simulate(scenario, parse(texts))
+    simulation = simulate(scenario, parse_mistakes(texts))
     imu = to_flight(simulation).imu
     time = imu.index.to_numpy()
     truth = attitude(simulation.motion.at(time))
@@ -189,7 +195,7 @@ class TestMistakes:
         ("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4),
     ])  # fmt: skip
     def test_simulated_clock_error_shifts_only_timestamps(self, text, offset_s, share):
-        late = simulate(UNFILTERED, parse([text]))
+        late = simulate(UNFILTERED, parse_mistakes([text]))
         time = late.positions.measured_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
@@ -197,7 +203,7 @@ class TestMistakes:
         assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
     def test_simulated_clock_jump_ends_at_timesync_convergence(self):
-        jumping = simulate(Scenario(seed=4), parse(["clock-jump=0.25"]))
+        jumping = simulate(Scenario(seed=4), parse_mistakes(["clock-jump=0.25"]))
         fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
         before = time < 50.0
         assert 0.0 < before.mean() < 1.0
@@ -207,7 +213,7 @@ class TestMistakes:
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
     def test_simulated_nlos_outliers_have_exact_fraction(self):
-        simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
+        simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse_mistakes(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measured_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
@@ -227,7 +233,7 @@ class TestMistakes:
         ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
     def test_simulated_dropout_removes_position_samples(self, text, start, end):
-        with_gap = simulate(UNFILTERED, parse([text]))
+        with_gap = simulate(UNFILTERED, parse_mistakes([text]))
         middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
         clean = self.CLEAN.positions.measured_s
@@ -236,7 +242,9 @@ class TestMistakes:
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
     def test_simulated_decimation_reduces_position_and_imu_rate(self, rate):
-        mistakes = parse([f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"])
+        mistakes = parse_mistakes(
+            [f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"]
+        )
         decimated, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
         samples = decimated.positions[0].samples
         assert len(samples) / decimated.log.duration_s == pytest.approx(rate, rel=0.1)
@@ -249,7 +257,7 @@ class TestMistakes:
 
     def test_simulated_low_pass_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
-        simulation = simulate(scenario, parse(["smoothed=0.5s"]))
+        simulation = simulate(scenario, parse_mistakes(["smoothed=0.5s"]))
         truth = simulation.motion.at(simulation.positions.measured_s)
         along = truth.velocity_m_s @ direction(30.0)
         lag = -(position_errors_m(simulation) @ direction(30.0))
@@ -257,15 +265,15 @@ class TestMistakes:
         settled = fast & np.roll(fast, 150)  # 3 s are six time constants
         assert np.any(settled)
         assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
-        noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"]))
+        noisy = simulate(replace(AISLE, ekf2=False), parse_mistakes(["smoothed=1s"]))
         assert (
             np.std(position_errors_m(noisy)[:25]) < 0.07
         )  # on the ground; 0.10 m without the filter
 
     def test_no_vvo_fault_removes_vehicle_visual_odometry(self):
-        remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
+        remaining = to_flight(simulate(AISLE, parse_mistakes(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
-        flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
+        flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_mistakes(["no-vvo"])))
         assert flight.positions == ()
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
             compare(flight)
@@ -280,15 +288,15 @@ class TestMistakes:
     ("no-motion", "no_motion", True),
 ])  # fmt: skip
 def test_parse_mistake_option_converts_units(text, field, value):
-    assert getattr(parse([text]), field) == pytest.approx(value)
+    assert getattr(parse_mistakes([text]), field) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
-    parsed = parse([name])
-    assert active_mistakes(parsed) == (name,)
-    assert parse([format_mistake(name, parsed)]) == parsed
-    assert active_mistakes(parse(["clock-offset=0", "nlos=0"])) == ()
+    parsed = parse_mistakes([name])
+    assert active_mistake_names(parsed) == (name,)
+    assert parse_mistakes([format_mistake(name, parsed)]) == parsed
+    assert active_mistake_names(parse_mistakes(["clock-offset=0", "nlos=0"])) == ()
 
 
 @pytest.mark.parametrize(("text", "expected"), [
@@ -304,7 +312,7 @@ def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
 ])  # fmt: skip
 def test_parse_invalid_mistake_option_raises_one_line_error(text, expected):
     with pytest.raises(SettingsError, match=expected) as error:
-        parse([text])
+        parse_mistakes([text])
     assert "\n" not in str(error.value)
 
 
@@ -325,7 +333,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
 ])  # fmt: skip
 def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
-        simulate(scenario, parse(texts))
+        simulate(scenario, parse_mistakes(texts))
 
 
 # --- ULog and memory
@@ -333,7 +341,7 @@ def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
 
 def test_simulated_ulog_contains_no_names_of_faults():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
-    content = to_ulog(simulate(AISLE, parse(texts)))
+    content = to_ulog(simulate(AISLE, parse_mistakes(texts)))
     for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
         # these names occur in the log for other reasons
         if name not in ("yaw", "scale", "jump", "heading", "mag"):

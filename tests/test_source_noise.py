@@ -11,7 +11,7 @@ from exchange import replace
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.trials import contradicts_truth
+from px4fuse.comparison.trials import makes_overconfident
 from px4fuse.diagnose import explain
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
@@ -128,7 +128,7 @@ def test_correlated_noise_is_distinguished_from_low_pass() -> None:
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.time_correlated_noise
         assert found.gain_nats > 30.0
-        assert (found.lag_nats > 1.0) == lags
+        assert (found.low_pass_gain_nats > 1.0) == lags
         assert found.slow_m >= found.white_m
 
 
@@ -158,7 +158,7 @@ def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
         if "sigma_z_m" in each.change and "nis" in each.discrepancies
     ]
     assert {each.axis for each in tried} == {"north", "east"}
-    assert all(contradicts_truth(each, "nis") == contradicts for each in tried)
+    assert all(makes_overconfident(each, "nis") == contradicts for each in tried)
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
     if contradicts:

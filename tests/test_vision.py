@@ -38,7 +38,7 @@ from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 OUTDOOR = make_scenario("outdoor", seed=3, passes=2)
@@ -52,7 +52,7 @@ FRAME_M = np.array([5.0, -3.0, 0.0])  # origin of the vision frame
 
 @cache
 def on_gnss() -> Model:
-    return opened(simulate_flight(OUTDOOR, parse(())))
+    return opened(simulate_flight(OUTDOOR, parse_mistakes(())))
 
 
 def sent(
@@ -118,7 +118,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
     noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
     deviation = np.sqrt(segment.variance)
-    x, P = segment.state.copy(), deviation[:, None] * segment.correlation * deviation
+    x, P = segment.state.copy(), deviation[:, None] * segment.state_correlation * deviation
     measured_at_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
     steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
@@ -187,7 +187,8 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
         heights=None, state=whole.state[:15], variance=whole.variance[:15],
         clipped_fraction=None, is_acceleration_bad=None,
-        correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
+        state_correlation=np.eye(15), attitude_variance_rad2=unknown,
+        down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
     known = {**inputs.settings, **SETTINGS, **settings}
@@ -423,7 +424,7 @@ def flown(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
         patch.setattr(simulated, "run_configurations", both)
-        flight = simulate_flight(OUTDOOR, parse(()))
+        flight = simulate_flight(OUTDOOR, parse_mistakes(()))
     updates = update_log(runs[0])
     enabled = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
     samples = pd.DataFrame({

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
 PUBLISHED = [
     ("evo_fr2_desk_ORB.txt", "evo_fr2_desk_groundtruth.txt"),
@@ -25,7 +25,10 @@ NAMES = [estimate.removesuffix(".txt") for estimate, _ in PUBLISHED]
 
 
 def flight(
-    seconds: float = 60.0, rate_hz: float = 20.0, kind: Kind = "truth", frame: Frame = "NED"
+    seconds: float = 60.0,
+    rate_hz: float = 20.0,
+    kind: TrajectoryKind = "truth",
+    frame: Frame = "NED",
 ) -> Trajectory:
     """Return a smooth flight in three dimensions with varying speed."""
     time = np.arange(0.0, seconds, 1.0 / rate_hz)

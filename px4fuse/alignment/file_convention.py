@@ -32,12 +32,16 @@ def explain_mismatch(
         return None
     axes, faults = convention.axes, []
     if UNITS[convention.unit] != metres_per_unit:
-        stated = next(name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit)
-        faults.append(describe_unit(convention.unit, "the positions", stated, is_file=True))
-    stated = problem.frames[0].upper() if len(problem.frames) == 1 else ""
+        stated_unit = next(
+            name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit
+        )
+        faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
+    stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
     is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
-    if stated and axes != FRAME_AXES[stated] and not is_rotated:
-        faults.append(describe_axes(axes, stated, is_mirrored=convention.is_mirrored, is_file=True))
+    if stated_frame and axes != FRAME_AXES[stated_frame] and not is_rotated:
+        faults.append(
+            describe_axes(axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=True)
+        )
     if not faults:
         return None
     fault_texts, actions = zip(*faults, strict=True)

@@ -17,26 +17,26 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTr
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# Frames that are tried if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
-YAW_FREE_FRAMES = ("ned", "enu")
-# Frames that are tried with a yaw of the user; frames with y up or down are not tried, because on
-# level flights along one axis they cannot be distinguished from frames with z up
-ALL_FRAMES = ("ned", "enu", "nwu")
+# Frames tried for a position file with estimated yaw: nwu is the same as enu rotated by 90°
+ESTIMATED_YAW_FRAMES = ("ned", "enu")
+# Frames tried for a position file with the yaw of the user: on level flights along one axis, frames
+# with y up or down cannot be distinguished from frames with z up
+GIVEN_YAW_FRAMES = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file: matching a day of positions takes five seconds
 MAX_SPAN_S = 86400.0
-# Minimum value of Lin's concordance correlation coefficient (1989) for a good match, by reference:
-# a match below it is printed with a warning, and does not show that the frame is rotated
-GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
+# Minimum value of Lin's concordance correlation coefficient (1989) for a match without a warning,
+# by reference; a worse match does not show that the frame is rotated
+MIN_GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
 # Minimum ratio of the residual in the second best frame to the residual in the best frame, for
 # accepting the best frame
-MIN_FRAME_RATIO = 1.3
+MIN_FRAME_RESIDUAL_RATIO = 1.3
 # Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
 # to report a misaligned frame
-MIN_ROTATION_RATIO = 2.0
+MIN_ROTATED_RESIDUAL_RATIO = 2.0
 # Minimum residual (m, RMS) with the user's yaw, to report a misaligned frame
-MIN_ROTATION_RMS_M = 0.3
+MIN_ROTATED_RESIDUAL_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class AlignmentProblem:
     samples : DataFrame
         Positions on the clock of the file.
     frames : tuple of str
-        Possible frames of the file; empty for all of ALL_FRAMES.
+        Possible frames of the file; empty if unknown.
     yaw_rad : float or None
         Yaw of the file's frame relative to the frame of EKF2.
     lag_s : float or None
@@ -124,7 +124,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     for make_references in reference_functions:
         try:
             match = _match(make_references(flight), problem)
-            _check_match(match)
+            _require_unique_match(match)
             return _refit_with_corrected_resets(flight, match, problem)
         except NoMatchError as error:
             if error.remedy and missing_options:
@@ -144,22 +144,22 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
-    frames = problem.frames or (YAW_FREE_FRAMES if yaw_rad is None else ALL_FRAMES)
+    frames = problem.frames or (ESTIMATED_YAW_FRAMES if yaw_rad is None else GIVEN_YAW_FRAMES)
     if tracks.horizontal_range_m(tracks.convert_to_ned(samples, frames[0])) < tracks.MIN_MOTION_M:
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
         )
     matches = []
     for reference in references:
-        name = reference.name
+        reference_name = reference.name
         fit_frame = partial(_best_fit, problem, reference)
         fit_by_frame = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
         fit_by_frame.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
         best_frame, fit = fit_by_frame[0]
         free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
-        is_rotated = is_good_fit(free_yaw_fit, name) and (
-            fit.concordance < MIN_CONCORDANCE[name]
-            or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
+        is_rotated = is_good_fit(free_yaw_fit, reference_name) and (
+            fit.concordance < MIN_CONCORDANCE[reference_name]
+            or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, reference_name)
         )
         residuals_m = {frame: fit.rms_m for frame, fit in fit_by_frame}
         matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
@@ -168,26 +168,27 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
     """Return True if the residual with estimated yaw is much smaller than ``horizontal_rms_m``."""
-    return horizontal_rms_m > MIN_ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
-        horizontal_rms_m > MIN_ROTATION_RMS_M or reference == IMU
+    return horizontal_rms_m > MIN_ROTATED_RESIDUAL_RATIO * free_yaw_fit.horizontal_rms_m and (
+        horizontal_rms_m > MIN_ROTATED_RESIDUAL_M or reference == IMU
     )
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
     """Return True if the match is good, and no other time offset fits nearly as well."""
     return (
-        fit.concordance >= GOOD_CONCORDANCE[reference]
+        fit.concordance >= MIN_GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
     )
 
 
-def _check_match(match: Match) -> None:
-    name = match.reference.name
+def _require_unique_match(match: Match) -> None:
+    reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < MIN_CONCORDANCE[name]:
+    if fit.concordance < MIN_CONCORDANCE[reference_name]:
         raise NoMatchError(
-            f"the position file does not match the {name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[name]:g} is needed)"
+            f"the position file does not match the {reference_name}: Lin's concordance correlation "
+            f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[reference_name]:g} "
+            "is needed)"
         )
     ambiguity = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
@@ -198,15 +199,18 @@ def _check_match(match: Match) -> None:
         ambiguity = f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
     if ambiguity:
         raise NoMatchError(
-            f"the time offset between position file and {name} cannot be estimated: {ambiguity}",
+            f"the time offset between position file and {reference_name} cannot be estimated: "
+            f"{ambiguity}",
             "Give `clock_offset_s`",
         )
     if len(match.residuals_m) > 1:
-        best_m, second_m = (np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2])
-        if second_m < MIN_FRAME_RATIO * best_m:
+        best_residual_m, second_residual_m = (
+            np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2]
+        )
+        if second_residual_m < MIN_FRAME_RESIDUAL_RATIO * best_residual_m:
             raise NoMatchError(
                 "the frame of the position file cannot be estimated, because several frames have "
-                f"similar residuals against the {name} ({match.residuals_text})",
+                f"similar residuals against the {reference_name} ({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
             )
 
@@ -216,27 +220,27 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
     fit = match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    aligned = tracks.align_samples(
+    aligned_samples = tracks.align_samples(
         problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
     )
-    track = tracks.ekf2_track_without_resets(ekf2, aligned)
+    ekf2_track = tracks.ekf2_track_without_resets(ekf2, aligned_samples)
     fit_again = partial(
         time_and_pose_fit.fit_by_least_squares,
         tracks.convert_to_ned(problem.samples, match.frame),
-        track,
+        ekf2_track,
         is_lag_free=problem.lag_s is None,
     )
     free_yaw_fit = fit_again(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
-    return replace(match, reference=track, fit=fit, free_yaw_fit=free_yaw_fit)
+    return replace(match, reference=ekf2_track, fit=fit, free_yaw_fit=free_yaw_fit)
 
 
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    track = tracks.convert_to_ned(problem.samples, frame)
+    file_track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
-    grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
+    grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
     if reference.name == IMU:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError(
@@ -244,11 +248,11 @@ def _best_fit(
                 "match with the IMU"
             )
         position_m = tracks.band_pass(tracks.band_pass(grid_track.position_m))
-        track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
+        file_track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:
         peak = time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)
     else:
         peak = CorrelationPeak(lag_s)
     return time_and_pose_fit.fit_by_least_squares(
-        track, reference, peak, yaw_rad, is_lag_free=lag_s is None
+        file_track, reference, peak, yaw_rad, is_lag_free=lag_s is None
     )

@@ -32,14 +32,15 @@ from px4fuse.readers.position_file import PositionRecording
 # Maximum ratio of the second best to the best residual for a warning about an ambiguous time
 # offset, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
-# Maximum fraction of rows with distinct timestamps for a finding that timestamps are too coarse
+# Maximum fraction of rows with distinct timestamps in a file whose timestamps are too coarse
 MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
-# Minimum rotation (°) of the frame of a position file for a message
+# Minimum rotation (°) of the frame of a position file for a message about a misaligned frame
 MIN_NAMED_YAW_DEG = 1.0
-# Minimum distance (m) of the origin of a position file from EKF2's origin for a message
+# Minimum distance (m) between the origins of position file and EKF2 for a message about a
+# misaligned frame
 MIN_NAMED_SHIFT_M = 1.0
 
 
@@ -116,7 +117,7 @@ def align_position_file(
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    clock_map = _shared_timestamps(recording)
+    clock_map = _clock_with_shared_timestamps(recording)
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -147,7 +148,7 @@ def align_position_file(
     )
 
 
-def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
+def _clock_with_shared_timestamps(recording: PositionRecording) -> ClockMap | None:
     """Return the clock of a file in which most rows repeat a timestamp, else None."""
     distinct_count = len(recording.samples)
     row_count = distinct_count + recording.dropped
@@ -200,7 +201,7 @@ def _describe_alignment(
                 f"({match.residuals_text})"
             )
             if is_yaw_free and frame == "enu":
-                frame_reason += "; nwu is enu with another yaw, and the yaw was estimated"
+                frame_reason += " (nwu was not tried, because nwu is enu rotated by 90°)"
         if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
@@ -268,15 +269,15 @@ def _compare_with_ekf2(
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2, is_known = tracks.ekf2_track_without_resets(flight.ekf2, aligned_samples).at(
-            aligned_samples.index.to_numpy()
-        )
+        ekf2_position_m, is_known = tracks.ekf2_track_without_resets(
+            flight.ekf2, aligned_samples
+        ).at(aligned_samples.index.to_numpy())
     except NoMatchError:
         return None
     if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
     file_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
-    ekf2_m = ekf2[is_known, :2]
+    ekf2_m = ekf2_position_m[is_known, :2]
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
@@ -289,13 +290,15 @@ def _compare_with_ekf2(
 def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
     if match is None:
         return ""
-    name = match.reference.name
+    reference_name = match.reference.name
     fit = match.free_yaw_fit
     is_rotated = match.is_rotated
     shift_text, shift_m = "", 0.0
     if distance_m is not None:
-        rms_m = truncated_rms(distance_m) / np.sqrt(2.0)
-        is_rotated = matching.is_good_fit(fit, name) and matching.needs_rotation(rms_m, fit, name)
+        residual_m = truncated_rms(distance_m) / np.sqrt(2.0)
+        is_rotated = matching.is_good_fit(fit, reference_name) and matching.needs_rotation(
+            residual_m, fit, reference_name
+        )
         shift_m = float(np.hypot(*fit.origin_m[:2]))
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
@@ -305,28 +308,28 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG and shift_m < MIN_NAMED_SHIFT_M:
         return ""
     return (
-        f"The frame of the position file is rotated by {yaw_deg:.1f}° against the {name}. "
-        f"{shift_text}Give --position-yaw auto to estimate yaw and origin."
+        f"The frame of the position file is rotated by {yaw_deg:.1f}° against the "
+        f"{reference_name}. {shift_text}Give --position-yaw auto to estimate yaw and origin."
     )
 
 
 def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:
     if match is None:
         return
-    name = match.reference.name
+    reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < matching.GOOD_CONCORDANCE[name]:
+    if fit.concordance < matching.MIN_GOOD_CONCORDANCE[reference_name]:
         yield (
-            f"The match of the position file with the {name} is poor: Lin's concordance "
+            f"The match of the position file with the {reference_name} is poor: Lin's concordance "
             f"correlation coefficient is {fit.concordance:.2f}."
         )
-    if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
+    if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[reference_name]:
         yield (
             f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: the "
             f"residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or set "
             "the time offset with --clock-offset."
         )
-    if is_yaw_free and name == IMU:
+    if is_yaw_free and reference_name == IMU:
         yield (
             "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the file's "
             "frame is unknown and set to 0."

@@ -92,22 +92,22 @@ def find_correlation_peak(
     track_moments = moments(
         file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
     )
-    count = track_moments.count
+    common_count = track_moments.count
     covariance = track_moments.covariance
-    power = track_moments.power_a + track_moments.power_b
-    min_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
-    has_overlap = count >= max(
-        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, min_count / 2.0)
+    power_sum = track_moments.power_a + track_moments.power_b
+    shorter_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
+    has_overlap = common_count >= max(
+        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_count / 2.0)
     )
     if not has_overlap.any():
         raise NoMatchError("position file and reference have too few common samples for a match")
-    has_overlap &= power > 1e-9 * np.max(power)  # at rest, the variance is a rounding error
+    has_overlap &= power_sum > 1e-9 * np.max(power_sum)  # at rest, the variance is a rounding error
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
-    concordance = np.zeros_like(power)
-    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power[has_overlap]
-    likelihood_gain = -count * np.log(np.maximum(1.0 - concordance, MIN_DISCORDANCE))
+    concordance = np.zeros_like(power_sum)
+    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power_sum[has_overlap]
+    likelihood_gain = -common_count * np.log(np.maximum(1.0 - concordance, MIN_DISCORDANCE))
     best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
 
     def lag_at(index: int) -> float:
@@ -117,27 +117,29 @@ def find_correlation_peak(
     # MIN_PEAK_DISTANCE_S, are the same peak
     low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
-    peak_end = np.min(low_indices[low_indices > best_index], initial=len(count))
+    peak_end = np.min(low_indices[low_indices > best_index], initial=len(common_count))
     is_other_peak = (
         has_overlap
-        & (count >= 0.5 * count[best_index])
-        & (power >= 0.25 * power[best_index])
+        & (common_count >= 0.5 * common_count[best_index])
+        & (power_sum >= 0.25 * power_sum[best_index])
         & (concordance >= MIN_CONCORDANCE[reference.name])
     )
-    min_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
-    same_peak_start = max(peak_start + 1, best_index - min_distance)
-    is_other_peak[same_peak_start : min(peak_end, best_index + min_distance + 1)] = False
+    min_peak_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
+    same_peak_start = max(peak_start + 1, best_index - min_peak_distance)
+    is_other_peak[same_peak_start : min(peak_end, best_index + min_peak_distance + 1)] = False
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
     # Residual (m) per axis, at least the interpolation error of the time grid
-    mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
-    residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
-    second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
+    mean_square_m2 = np.maximum(power_sum - 2.0 * real_covariance, 0.0) / (
+        2.0 * np.maximum(common_count, 1.0)
+    )
+    residual_m = np.sqrt(mean_square_m2 + GRID_RESIDUAL_M**2)
+    second_index = int(np.argmin(np.where(is_other_peak, residual_m, np.inf)))
     return replace(
         peak,
-        second_peak_s=lag_at(second_peak) - lag_at(best_index),
-        second_peak_ratio=float(residual[second_peak] / residual[best_index]),
+        second_peak_s=lag_at(second_index) - lag_at(best_index),
+        second_peak_ratio=float(residual_m[second_index] / residual_m[best_index]),
     )
 
 
@@ -166,7 +168,7 @@ def fit_by_least_squares(
             f"only {np.count_nonzero(is_used)} positions of the file are within the time of the "
             "reference"
         )
-    time = file_track.time_s[is_used] + peak.lag_s
+    reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_m = file_track.horizontal_m[is_used]
     target_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_m)
@@ -176,29 +178,29 @@ def fit_by_least_squares(
     coherence = (
         complex(np.vdot(file_m, target_m) / len(file_m) / std_product) if std_product > 0 else 0j
     )
-    mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
-    horizontal = reference.horizontal_m
+    mean_variance = float(np.var(file_m) + np.var(target_m)) / 2.0
+    reference_horizontal_m = reference.horizontal_m
 
     # Parameters: origin north, origin east, lag relative to the peak, yaw
     parameters = np.array([target_m.mean().real, target_m.mean().imag, 0.0, np.angle(coherence)])
     bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])
-    is_free = np.array([True, True, is_lag_free, yaw_rad is None])
+    is_fitted = np.array([True, True, is_lag_free, yaw_rad is None])
     if yaw_rad is not None:
         parameters[3] = yaw_rad
 
     def residuals_at(free_parameters: Array) -> Array:
-        parameters[is_free] = free_parameters
+        parameters[is_fitted] = free_parameters
         north, east, lag_shift_s, yaw = parameters
-        target = np.interp(time + lag_shift_s, reference.time_s, horizontal)
+        target = np.interp(reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m)
         residuals = np.exp(1j * yaw) * file_m + complex(north, east) - target
         return np.concatenate([residuals.real, residuals.imag])
 
     solution = least_squares(
         residuals_at,
-        parameters[is_free],
-        bounds=(-bounds[is_free], bounds[is_free]),
+        parameters[is_fitted],
+        bounds=(-bounds[is_fitted], bounds[is_fitted]),
         loss="soft_l1",
-        f_scale=_robust_scale(residuals_at(parameters[is_free])),
+        f_scale=_robust_scale(residuals_at(parameters[is_fitted])),
     )
     residuals = residuals_at(solution.x)
     north, east, lag_shift_s, yaw = parameters.tolist()
@@ -214,16 +216,18 @@ def fit_by_least_squares(
     )
     sigma = np.sqrt(np.maximum(variance, 0.0))
     is_at_limit = is_lag_free and abs(lag_shift_s) > 0.99 * MAX_LAG_SHIFT_S
-    ned, _ = reference.at(time + lag_shift_s)
-    down_difference = ned[:, 2] - file_track.position_m[is_used, 2]
-    down_difference = down_difference[np.isfinite(down_difference)]
-    origin_down = float(np.median(down_difference)) if len(down_difference) else 0.0
-    horizontal_rms = truncated_rms(np.abs(complex_residuals)) / np.sqrt(2.0)
-    vertical_rms = truncated_rms(down_difference - origin_down) if len(down_difference) else 0.0
+    reference_ned_m, _ = reference.at(reference_time_s + lag_shift_s)
+    down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
+    down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
+    origin_down_m = float(np.median(down_difference_m)) if len(down_difference_m) else 0.0
+    horizontal_rms_m = truncated_rms(np.abs(complex_residuals)) / np.sqrt(2.0)
+    vertical_rms_m = (
+        truncated_rms(down_difference_m - origin_down_m) if len(down_difference_m) else 0.0
+    )
     concordance = peak.concordance
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
-        concordance = real_covariance * std_product / mean_square if std_product > 0 else 0.0
+        concordance = real_covariance * std_product / mean_variance if std_product > 0 else 0.0
     origin = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,
@@ -233,10 +237,10 @@ def fit_by_least_squares(
         second_peak_ratio=peak.second_peak_ratio,
         yaw_rad=yaw,
         yaw_sigma_rad=float(sigma[-1]) if yaw_rad is None else None,
-        origin_m=np.array([origin.real, origin.imag, origin_down]),
+        origin_m=np.array([origin.real, origin.imag, origin_down_m]),
         coherence=coherence,
-        horizontal_rms_m=float(horizontal_rms),
-        rms_m=float(np.sqrt(2.0 * horizontal_rms**2 + vertical_rms**2)),
+        horizontal_rms_m=float(horizontal_rms_m),
+        rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
     )
 
 
@@ -249,12 +253,12 @@ def _autocorrelation_factor(residual: Complex) -> float:
     """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
     limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
-    rho = autocovariance(clipped)
-    if rho[0] <= 0.0:
+    covariance_by_lag = autocovariance(clipped)
+    if covariance_by_lag[0] <= 0.0:
         return 1.0
-    zero_crossings = np.flatnonzero(rho <= 0.0)
-    first_zero = zero_crossings[0] if len(zero_crossings) else len(rho)
-    return float(1.0 + 2.0 * np.sum(rho[1:first_zero]) / rho[0])
+    zero_crossings = np.flatnonzero(covariance_by_lag <= 0.0)
+    first_zero = zero_crossings[0] if len(zero_crossings) else len(covariance_by_lag)
+    return float(1.0 + 2.0 * np.sum(covariance_by_lag[1:first_zero]) / covariance_by_lag[0])
 
 
 def truncated_rms(values_m: Array) -> float:

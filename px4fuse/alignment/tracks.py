@@ -27,7 +27,7 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# A gap in a track is longer than this time (s), and longer than three median intervals
+# Minimum length (s) of a gap in a track; a gap is also longer than three median intervals
 MIN_GAP_LIMIT_S = 0.5
 # Minimum horizontal motion (m) of a track for a match
 MIN_MOTION_M = 0.5
@@ -89,9 +89,9 @@ class SampledTrack:
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Convert the positions of a file to north, east, down, with times from the first sample."""
-    order, sign = FRAMES[frame]
-    position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
-    return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position)
+    axis_order, axis_signs = FRAMES[frame]
+    position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, axis_order] * axis_signs
+    return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position_m)
 
 
 def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
@@ -100,9 +100,9 @@ def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
     """Resample a track to a regular time grid, and mark samples inside gaps as invalid."""
-    grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
-    is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
-    return SampledTrack(grid, track.at(grid)[0], is_known)
+    grid_s = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
+    is_known = is_bracketed(grid_s, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
+    return SampledTrack(grid_s, track.at(grid_s)[0], is_known)
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
@@ -173,13 +173,13 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError("the log has no acceleration in NED")
-    time = acceleration.index.to_numpy()
-    velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = resample_to_grid(_track_without_gaps(time, velocity))
+    time_s = acceleration.index.to_numpy()
+    velocity_m_s = cumulative_trapezoid(acceleration.to_numpy(), time_s, axis=0, initial=0)
+    grid = resample_to_grid(_track_without_gaps(time_s, velocity_m_s))
     if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
-    position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
-    return [mark_transients(replace(grid, position_m=band_pass(position), name=IMU))]
+    position_m = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
+    return [mark_transients(replace(grid, position_m=band_pass(position_m), name=IMU))]
 
 
 def align_samples(
@@ -191,16 +191,16 @@ def align_samples(
     diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
     """
     track = convert_to_ned(samples, frame)
-    position = track.position_m
-    order, _ = FRAMES[frame]
-    variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
+    position_m = track.position_m
+    axis_order, _ = FRAMES[frame]
+    variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
     if yaw_rad:  # a rotation mixes both axes, so both sigmas are then needed
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         rotation = np.array([[c, -s], [s, c]])
-        position[:, :2] = position[:, :2] @ rotation.T
-        variance[:, :2] = variance[:, :2] @ (rotation**2).T
+        position_m[:, :2] = position_m[:, :2] @ rotation.T
+        variance_m2[:, :2] = variance_m2[:, :2] @ (rotation**2).T
     return pd.DataFrame(
-        np.hstack([position + origin_m, variance]),
+        np.hstack([position_m + origin_m, variance_m2]),
         time_index(track.time_s + lag_s),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )

@@ -15,15 +15,15 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
-from px4fuse.verification.pdf_input import MAX_PDF_BYTES, attached_results
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from the results of one input to analyse the log of the other input
-_FILTER_FIELDS = (*Settings.__dataclass_fields__, "axes")
-# Settings that are copied only if both inputs belong to the same log
-_SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
+_FILTER_FIELDS = {*Settings.__dataclass_fields__, "axes"}
+# Settings that are not copied even if both inputs belong to the same log
+_FILE_FIELDS = {"log", "system", "position"}
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def _read_attached(path: Path) -> InputResults | None:
     limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=remedy)
-    results = (attached_results if is_report else read_results)(content, name)
+    results = (read_attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(
             f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "
@@ -78,7 +78,7 @@ def _analyse_log(path: Path, other_input: InputResults | None, progress: Progres
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
         is_same = other_input.results.log.sha256 in files_by_sha256([path])
-        fields = (*_FILTER_FIELDS, *_SEGMENT_FIELDS) if is_same else _FILTER_FIELDS
+        fields = {*request.__struct_fields__} - _FILE_FIELDS if is_same else _FILTER_FIELDS
         request = replace(
             request, **{name: getattr(other_input.results.request, name) for name in fields}
         )

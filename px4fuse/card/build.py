@@ -45,7 +45,7 @@ from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log
 from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.filter.consistency import classify_ratio
+from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -353,7 +353,7 @@ def _worst_axis_sentences(analysis: Analysis) -> list[str]:
     ratio = math.sqrt(worst_errors.nees_position_mean or 0.0)
     main_truth = analysis.main.filters["ekf2"].truth
     main_nees = 0.0 if isinstance(main_truth, Unavailable) else main_truth.nees_position_mean or 0.0
-    if classify_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
+    if classify_sigma_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
         return []
     return [
         f"EKF2's RMSE along {axis_label} is {format_metres(worst_errors.position_rmse_m)} m, "
@@ -454,7 +454,7 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     )
     nees = float(np.nanmean(np.square(error_m) / horizon_track["position_variance_m2"]))
     ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
-    return ratio if classify_ratio(ratio, "truth") == "consistent" else None
+    return ratio if classify_sigma_ratio(ratio, "truth") == "consistent" else None
 
 
 def _explain_differing_verdicts(

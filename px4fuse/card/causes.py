@@ -23,7 +23,7 @@ from px4fuse.comparison.trials import (
     remains_overconfident,
 )
 from px4fuse.core.text import lower_first, with_log_name
-from px4fuse.filter.consistency import classify_ratio
+from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
@@ -382,7 +382,7 @@ def _closing_sentence(
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]
-    if ratios_after and classify_ratio(min(ratios_after), "truth") == "overconfident":
+    if ratios_after and classify_sigma_ratio(min(ratios_after), "truth") == "overconfident":
         return (
             "After this fix, the reported σ is still too small against ground truth: another "
             "error remains."

@@ -10,7 +10,7 @@ from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import Reference, classify_ratio, ratio_interval
+from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
 
 # Length (s) of the bootstrap blocks: longer than the correlation time of position errors
@@ -40,7 +40,7 @@ def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> 
         filter=filter_name,
         against="source",
         ratio=summary.sigma_ratio,
-        interval=ratio_interval(summary.nis_mean, summary.nis_band),
+        interval=sigma_ratio_interval(summary.nis_mean, summary.nis_band),
         word=summary.verdict,
         samples=summary.count,
     )
@@ -61,7 +61,7 @@ def _verdict_against_truth(result: AxisComparison, filter_name: FilterName) -> V
         against="truth",
         ratio=ratio,
         interval=interval,
-        word=classify_ratio(ratio, "truth", interval),
+        word=classify_sigma_ratio(ratio, "truth", interval),
         samples=len(normalised_errors),
     )
 

@@ -18,29 +18,29 @@ from px4fuse.core.input_files import inputs_protected
 from px4fuse.core.threads import ONE_THREAD
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
 
-# Help text of each command; --help does not import the modules of the commands, which is slow
-COMMANDS = {
-    "compare": "Check EKF2 against a two-state Kalman filter and report faults.",
-    "batch": "Compare KF and EKF2 on many logs and write one table.",
-    "diff": "List differences between two flights or reports.",
-    "answers": "Write the answer form of a student for a flight.",
-    "explore": "Write an interactive page with sliders for the filter settings.",
-    "practice": "Write a quiz page with simulated flights and injected faults.",
-    "info": "List the contents of a log and which analyses are possible.",
-    "explain": "Explain a finding: meaning, example, action, false alarms.",
-    "extract": "Export a log as tables (CSV or Parquet).",
-    "tune": "Estimate SIGMA_A and SIGMA_Z by maximum likelihood.",
-    "sync": "Estimate the time offset between position source and IMU.",
-    "whatif": "Replay EKF2 with changed parameters.",
-    "loop": "Measure and correct the loop closure error of odometry.",
-    "evaluate": "Compute ATE and RPE of a trajectory against a reference.",
-    "simulate": "Simulate a flight with ground truth and injected faults.",
-    "verify": "Verify that the numbers of a report follow from its log.",
-    "grade": "Verify and grade the reports of a class.",
-    "sample": "Write the sample logs (aisle with UWB, loop with VIO).",
-    "mcp": "Serve px4fuse to assistants (Model Context Protocol).",
-    "lesson": "Print the worked examples of the lesson UAT 366, module 2.",
-}
+# Names of the commands, in the order of --help: each one is function NAME in the module cli/NAME.py
+COMMANDS = (
+    "compare",
+    "batch",
+    "diff",
+    "answers",
+    "explore",
+    "practice",
+    "info",
+    "explain",
+    "extract",
+    "tune",
+    "sync",
+    "whatif",
+    "loop",
+    "evaluate",
+    "simulate",
+    "verify",
+    "grade",
+    "sample",
+    "mcp",
+    "lesson",
+)
 
 
 #: Signals that end a run: Ctrl-C, termination, and a closed terminal (except on Windows)
@@ -68,11 +68,7 @@ class LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        module = importlib.import_module(f"px4fuse.cli.{cmd_name}")
-        command: click.Command = getattr(module, cmd_name)
-        return command
+        return find_command(cmd_name) if cmd_name in COMMANDS else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -112,7 +108,17 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, help_text(name)) for name in COMMANDS])
+
+
+def find_command(name: str) -> click.Command:
+    command: click.Command = getattr(importlib.import_module(f"px4fuse.cli.{name}"), name)
+    return command
+
+
+def help_text(name: str) -> str:
+    """Return the first sentence of the help of a command."""
+    return find_command(name).get_short_help_str(limit=100)
 
 
 @click.group(

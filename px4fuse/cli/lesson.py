@@ -5,7 +5,7 @@ import click
 
 @click.group()
 def lesson() -> None:
-    """Print the worked examples of the lesson UAT 366, module 2, computed by px4fuse."""
+    """Print the worked examples of the lesson UAT 366, module 2."""
 
 
 @lesson.command()

@@ -16,7 +16,7 @@ from typing import Any, get_args
 
 import click
 
-from px4fuse.cli import COMMANDS, TERMINATION_SIGNALS, cli, options, outputs
+from px4fuse.cli import TERMINATION_SIGNALS, cli, find_command, help_text, options, outputs
 from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
 from px4fuse.errors import SettingsError
 
@@ -151,7 +151,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
         tool = Tool(
             name=name,
-            description=COMMANDS[command_name] if parameters else "List the ids of all findings.",
+            description=help_text(command_name) if parameters else "List the ids of all findings.",
             input_schema=_input_schema(parameters),
             output_schema=output_schema,
         )
@@ -161,8 +161,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
     """Return the parameters of a command that are arguments of its tool, by argument name."""
-    command = cli.get_command(click.Context(cli), command_name)
-    assert command is not None
+    command = find_command(command_name)
     names = {str(one.name): one for one in command.params if one.expose_value}
     return {ARGUMENT_NAMES.get(name, name): names[name] for name in names if name not in HIDDEN}
 

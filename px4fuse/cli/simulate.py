@@ -22,14 +22,19 @@ from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError, to_one_line
-from px4fuse.simulation.mistakes import MISTAKES, active_mistakes, format_mistake, parse
+from px4fuse.simulation.mistakes import (
+    MISTAKES,
+    active_mistake_names,
+    format_mistake,
+    parse_mistakes,
+)
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
-    Kind,
     Scenario,
-    Yaw,
+    ScenarioKind,
+    YawMode,
+    bounds_by_field,
     make_scenario,
-    quantities,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +44,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
-OUTDOOR_KIND: Kind = "outdoor"
+OUTDOOR_KIND: ScenarioKind = "outdoor"
 SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
 # Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
@@ -58,7 +63,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 def _scenario_options(command: Command) -> Command:
     """Add an option for each number of a scenario, with default and help of the field."""
-    for field, quantity in reversed(quantities(Scenario).items()):
+    for field, quantity in reversed(bounds_by_field(Scenario).items()):
         if not quantity.meaning:
             continue
         default, outdoors = (
@@ -81,7 +86,7 @@ class WithMistakes(click.Command):
                 [
                     (
                         f"{name}{mistake.usage}",
-                        mistake.help + (f" [{mistake.default:g}]" if mistake.sizes else ""),
+                        mistake.help + (f" [{mistake.default:g}]" if mistake.size_fields else ""),
                     )
                     for name, mistake in MISTAKES.items()
                 ]
@@ -114,7 +119,7 @@ class WithMistakes(click.Command):
 )
 @click.option(
     "--kind",
-    type=Choice((*get_args(Kind), MIXED_KIND)),
+    type=Choice((*get_args(ScenarioKind), MIXED_KIND)),
     default=_DEFAULT_SCENARIO.kind,
     help="Kind of flight. aisle: passes along an aisle with UWB; loop: laps of a square with "
     "drifting VIO; outdoor: laps of a square with GNSS; mixed: with --assignment, loop for one "
@@ -151,7 +156,7 @@ class WithMistakes(click.Command):
 )
 @click.option(
     "--yaw",
-    type=Choice(get_args(Yaw)),
+    type=Choice(get_args(YawMode)),
     help="Heading of the vehicle: fixed, or follow (along the flight direction).  [default: fixed; "
     "follow on a square]",
 )
@@ -166,10 +171,10 @@ def simulate(
     answer: Path | None,
     no_truth: bool,
     no_ekf2: bool,
-    kind: Literal[Kind, "mixed"],
+    kind: Literal[ScenarioKind, "mixed"],
     seed: int,
     passes: int | None,
-    yaw: Yaw | None,
+    yaw: YawMode | None,
     **option_values: Any,
 ) -> None:
     """Simulate a flight with ground truth and injected faults.
@@ -193,10 +198,10 @@ def simulate(
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
-    mistake_sizes = parse(mistake)
+    mistake_sizes = parse_mistakes(mistake)
     option_values |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = make_scenario(
-        cast(Kind, kind),
+        cast(ScenarioKind, kind),
         truth=not no_truth,
         ekf2=not no_ekf2,
         **{name: value for name, value in option_values.items() if value is not None},
@@ -323,7 +328,7 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     page.write_labelled_texts(texts)
     mistake_texts = [
         f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}"
-        for name in active_mistakes(simulation.mistakes)
+        for name in active_mistake_names(simulation.mistakes)
     ]
     page.write_labelled("Faults", *(mistake_texts or ["none"]))
     page.write_labelled("Truth", "logged" if scenario.truth else "not logged")

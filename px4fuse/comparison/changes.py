@@ -47,7 +47,7 @@ ACC_NOISE = "EKF2_ACC_NOISE"
 # Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
 # SIGMA_A also covers tilt error and bias
 VIBRATION_FACTOR = 3.0
-# EKF2 parameters for which a re-run uses PX4's default, if the flight had another value
+# EKF2 parameters that a re-run sets to PX4's default if the log has another value
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -56,7 +56,7 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum yaw misalignment, in σ of its estimate, for a re-run with rotated positions
+# Minimum yaw misalignment, in σ of its estimate, that a re-run corrects
 HEADING_SIGMAS = 3.0
 
 
@@ -71,21 +71,23 @@ def candidate_changes(
     summary, origin = result.filters["kf" if inputs is None else "ekf2"], comparison.source.origin
     assert isinstance(summary, FilterSummary)  # only a tested filter has a discrepancy
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
-    tuned = tuning_of_axis(estimates.tuning, result.axis.name)
+    axis_tuning = tuning_of_axis(estimates.tuning, result.axis.name)
     changes = list[Change]()
     # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
     # smaller noise
     hides_slow_errors = origin.may_drift or origin.is_gnss
-    if tuned is not None and not (is_underconfident and hides_slow_errors):
+    if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
         changes += (
-            _kf_noises(comparison.settings, tuned, is_underconfident)
+            _kf_noises(comparison.settings, axis_tuning, is_underconfident)
             if inputs is None
-            else _ekf2_noise(inputs, summary, tuned)
+            else _ekf2_noise(inputs, summary, axis_tuning)
         )
-    if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
-        changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
-    delay = {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
-    changes += [delay] if delay else _time_offset(estimates, inputs)
+    if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
+        changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
+    delay_parameters = (
+        {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
+    )
+    changes += [delay_parameters] if delay_parameters else _time_offset(estimates, inputs)
     if result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
@@ -94,8 +96,8 @@ def candidate_changes(
     if inputs is None:
         return changes + _without_bias(estimates)
     changes += _px4_defaults(comparison.flight.log, inputs)
-    if tuned is not None and not is_underconfident:
-        changes += _vibration_noise(comparison.settings, inputs, tuned)
+    if axis_tuning is not None and not is_underconfident:
+        changes += _vibration_noise(comparison.settings, inputs, axis_tuning)
     return changes
 
 
@@ -114,13 +116,13 @@ def main_axis_changes(
     )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
-        offsets = _time_offset(estimates, inputs) if has_delay else []
-        return unique_changes([*changes, *offsets])
-    noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
-    if len(noises) > 1:
-        changes.append({name: value for change in noises for name, value in change.items()})
+        offset_changes = _time_offset(estimates, inputs) if has_delay else []
+        return unique_changes([*changes, *offset_changes])
+    noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
+    if len(noise_changes) > 1:
+        changes.append({name: value for change in noise_changes for name, value in change.items()})
     defaults = default_settings(comparison)
-    return [*changes, *([defaults] if defaults and noises else [])]
+    return [*changes, *([defaults] if defaults and noise_changes else [])]
 
 
 def unique_changes(changes: Iterable[Change]) -> list[Change]:
@@ -143,12 +145,12 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 def default_settings(comparison: Comparison) -> Change:
     """Return KF's default noises in place of the values that the user chose."""
-    chosen, default = comparison.settings, Settings()
+    chosen_settings, px4fuse_default = comparison.settings, Settings()
     names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
-        name: getattr(default, name)
+        name: getattr(px4fuse_default, name)
         for name in names
-        if getattr(chosen, name) != getattr(default, name)
+        if getattr(chosen_settings, name) != getattr(px4fuse_default, name)
     }
 
 
@@ -174,63 +176,70 @@ def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
     return [change]
 
 
-def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
+def _kf_noises(
+    settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
+) -> list[Change]:
     """Return the noise estimates that differ significantly from the settings."""
     changes = list[Change]()
-    for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
+    for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         chosen_sigma = getattr(settings, name)
         ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
-        bound = noise.high if is_underconfident else noise.low
+        noise_bound = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
             ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
         if (
             ml_sigma
-            and bound is not None
-            and (chosen_sigma > bound if is_underconfident else chosen_sigma < bound)
+            and noise_bound is not None
+            and (chosen_sigma > noise_bound if is_underconfident else chosen_sigma < noise_bound)
         ):
             changes.append({name: float(f"{ml_sigma:.3g}")})
     return changes
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    fit = estimates.bias_scale_jump_fit
-    if isinstance(fit, Unavailable) or not fit.has_bias:
+    systematic_errors = estimates.systematic_errors
+    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
         return []
-    biases = {FORWARD_BIAS: fit.forward_bias, RIGHT_BIAS: fit.right_bias}
+    biases = {
+        FORWARD_BIAS: systematic_errors.forward_bias,
+        RIGHT_BIAS: systematic_errors.right_bias,
+    }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
 
-def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
+def _ekf2_noise(inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning) -> list[Change]:
     """Return EKF2 parameters for the estimated position noise, if it differs significantly."""
-    noise_m = tuned.sigma_z.value
+    noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    change = ml_noise_change(inputs, tuned.sigma_z, noise_m)
+    change = ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
     """Return PX4's default of each changed noise, and of a gate below PX4's default."""
-    gate, flown = inputs.aid.gate, inputs.settings
+    gate, logged_parameters = inputs.aid.gate, inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
     return [
         {name: value}
         for name, value in defaults.items()
-        if name in flown
-        and not np.isclose(flown[name], value, rtol=1e-3)
-        and (name != gate or flown[name] < value)
+        if name in logged_parameters
+        and not np.isclose(logged_parameters[name], value, rtol=1e-3)
+        and (name != gate or logged_parameters[name] < value)
     ]
 
 
-def _vibration_noise(settings: Settings, inputs: Inputs, tuned: AxisTuning) -> list[Change]:
+def _vibration_noise(settings: Settings, inputs: Inputs, axis_tuning: AxisTuning) -> list[Change]:
     """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
     in each DT.
     """
-    steps = settings.dt_s / inputs.step_s
-    flown, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
-    if (tuned.sigma_a_two_state.low or 0.0) * steps**0.5 <= VIBRATION_FACTOR * flown:
+    steps_per_dt = settings.dt_s / inputs.step_s
+    logged_noise, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    if (
+        axis_tuning.sigma_a_two_state.low or 0.0
+    ) * steps_per_dt**0.5 <= VIBRATION_FACTOR * logged_noise:
         return []
-    ml_noise = min((tuned.sigma_a_two_state.value or 0.0) * steps**0.5, px4_maximum)
-    return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > flown else []
+    ml_noise = min((axis_tuning.sigma_a_two_state.value or 0.0) * steps_per_dt**0.5, px4_maximum)
+    return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > logged_noise else []

@@ -62,14 +62,14 @@ def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
-    state, variance, truth = tracks.values()
+    ekf2_state, ekf2_variance, truth = tracks.values()
     innovations: Frame
     if isinstance(ekf2, Unavailable):
         innovations, gate = ekf2, DEFAULT_GATE
     else:
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
         gate = ekf2.gate
-    ekf2_errors = error_statistics(state, variance, truth)
+    ekf2_errors = error_statistics(ekf2_state, ekf2_variance, truth)
     if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
         horizon_nees = _horizon_nees(projection.project_horizon(ekf2, axis, segment), truth)
         ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=horizon_nees)
@@ -77,7 +77,10 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
-    (north, east, down), rejected = axis.direction.tolist(), _known_values(innovations, "rejected")
+    (north, east, down), rejected_flags = (
+        axis.direction.tolist(),
+        _known_values(innovations, "rejected"),
+    )
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north, east, down),
@@ -91,12 +94,12 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         ),
         filters={
             "kf": _summarise_filter(
-                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), DEFAULT_GATE
+                updates, kf_run.steps, kf_error_statistics(kf_run, truth, ekf2_state), DEFAULT_GATE
             ),
-            "ekf2": _summarise_filter(innovations, variance, ekf2_errors, gate),
+            "ekf2": _summarise_filter(innovations, ekf2_variance, ekf2_errors, gate),
         },
-        difference=difference(kf_run, state),
-        rejected_fraction=float(rejected.mean()) if len(rejected) else None,
+        difference=difference(kf_run, ekf2_state),
+        rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         replay=kf_run,
         ekf2_innovations=innovations,
@@ -133,8 +136,11 @@ def _summarise_filter(
         )
     }
     if not isinstance(innovations, Unavailable):
-        nu, s = innovations["innovation_m"], innovations["innovation_variance_m2"]
-        consistency = assess(nu.to_numpy(), s.to_numpy(), gate)
+        innovation_m, variance_m2 = (
+            innovations["innovation_m"],
+            innovations["innovation_variance_m2"],
+        )
+        consistency = assess(innovation_m.to_numpy(), variance_m2.to_numpy(), gate)
         if not isinstance(consistency, Unavailable):
             return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
         innovations = consistency
@@ -153,21 +159,21 @@ def difference(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
         np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
         - ekf2_state[[*STATE_COLUMNS]].to_numpy().T
     )
-    position, velocity = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
-    if len(position) < projection.MIN_COMMON_SAMPLES:
+    position_m, velocity_m_s = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
+    if len(position_m) < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "difference KF - EKF2",
-            f"KF and EKF2 have only {len(position)} common samples",
+            f"KF and EKF2 have only {len(position_m)} common samples",
             "Choose a time span in which EKF2 runs.",
         )
     return Difference(
-        count=len(position),
-        position_rms_m=_rmse(position),
-        position_mean_m=float(np.mean(position)),
-        position_maximum_m=float(np.max(np.abs(position))),
-        velocity_rms_m_s=_rmse(velocity),
-        velocity_mean_m_s=float(np.mean(velocity)),
-        velocity_maximum_m_s=float(np.max(np.abs(velocity))),
+        count=len(position_m),
+        position_rms_m=_rmse(position_m),
+        position_mean_m=float(np.mean(position_m)),
+        position_maximum_m=float(np.max(np.abs(position_m))),
+        velocity_rms_m_s=_rmse(velocity_m_s),
+        velocity_mean_m_s=float(np.mean(velocity_m_s)),
+        velocity_maximum_m_s=float(np.max(np.abs(velocity_m_s))),
     )
 
 
@@ -184,14 +190,16 @@ def kf_error_statistics(
 
 def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at EKF2's sample times, else at KF's prediction times."""
-    frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
-    return kf_state_and_variance(kf_run, frame.index.to_numpy())
+    time_frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
+    return kf_state_and_variance(kf_run, time_frame.index.to_numpy())
 
 
-def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at ``times`` (s)."""
+def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return state and variances of KF at ``times_s`` (s)."""
     state, variance = (
-        pd.DataFrame(dict(zip(columns, state_function(kf_run, times), strict=True)), index=times)
+        pd.DataFrame(
+            dict(zip(columns, state_function(kf_run, times_s), strict=True)), index=times_s
+        )
         for columns, state_function in ((STATE_COLUMNS, state_at), (VARIANCE_COLUMNS, variance_at))
     )
     return state, variance
@@ -232,8 +240,8 @@ def error_statistics(
 def _horizon_nees(horizon_state: pd.DataFrame | None, truth: Frame) -> float | None:
     if horizon_state is None or isinstance(truth, Unavailable):
         return None
-    errors = _errors(horizon_state, truth, "position_m")
-    return _mean_nees(errors / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
+    errors_m = _errors(horizon_state, truth, "position_m")
+    return _mean_nees(errors_m / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
@@ -250,8 +258,12 @@ def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
     return np.asarray(np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan)))
 
 
-def _mean_nees(normalised: Array) -> float | None:
-    return float(np.nanmean(np.square(normalised))) if np.isfinite(normalised).any() else None
+def _mean_nees(normalised_errors: Array) -> float | None:
+    return (
+        float(np.nanmean(np.square(normalised_errors)))
+        if np.isfinite(normalised_errors).any()
+        else None
+    )
 
 
 def position_errors(result: AxisComparison, filter_name: FilterName) -> Frame:
@@ -271,9 +283,9 @@ def position_errors(result: AxisComparison, filter_name: FilterName) -> Frame:
     else:
         state, variance = result.ekf2_state, result.ekf2_variance
     time_s = state.index.to_numpy()
-    errors = _errors(state, result.truth, STATE_COLUMNS[0])
-    sigma = reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
-    return pd.DataFrame({"error_m": errors, "sigma_m": sigma}, index=time_s)
+    errors_m = _errors(state, result.truth, STATE_COLUMNS[0])
+    sigma_m = reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
+    return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
 
 
 def normalised_position_errors(
@@ -285,14 +297,14 @@ def normalised_position_errors(
         return errors
     if filter_name == "ekf2" and isinstance(result.ekf2_variance, Unavailable):
         return result.ekf2_variance
-    normalised = (errors["error_m"] / errors["sigma_m"]).dropna()
-    if normalised.empty:
+    normalised_errors = (errors["error_m"] / errors["sigma_m"]).dropna()
+    if normalised_errors.empty:
         return Unavailable(
             "error against ground truth",
             "no analysed sample has both a reported σ and ground truth",
             "Choose a time span with a reported σ and ground truth.",
         )
-    return normalised.index.to_numpy(), normalised.to_numpy()
+    return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
 def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:

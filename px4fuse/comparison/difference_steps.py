@@ -32,17 +32,16 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Maximum relative difference between position RMSEs that the report calls equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference KF - EKF2 for a sentence on the second replacement
+# Minimum fraction of the mean square difference KF - EKF2 for the second cause in the report
 MIN_NOTABLE_FRACTION = 0.05
-# Minimum factor between a KF noise setting and its estimate for a correction before the
-# replacements
+# Minimum factor between a KF noise setting and its estimate that is corrected first
 MIN_SETTING_RATIO = 4.0
 # Minimum position change (m) by a replacement that the report lists
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum position difference KF - EKF2 (m) outside the replayed times for a sentence
+# Minimum position difference KF - EKF2 (m) outside the replayed times that is reported
 MIN_UNREPLAYED_M = 0.5
-# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to the largest one
-# inside, for a sentence
+# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to the largest
+# inside that is reported
 MIN_UNREPLAYED_RATIO = 3.0
 
 
@@ -50,42 +49,44 @@ def explain_ekf2_difference(
     comparison: Comparison,
     model: Model | Unavailable,
     clock: ClockOffset | Unavailable,
-    corrected: Mapping[str, Any],
+    estimated_noises: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``corrected`` contains noise estimates that replace wrong settings of KF
+    ``estimated_noises`` contains noise estimates that replace wrong settings of KF
     (:func:`corrected_settings`). If only the down axis was analysed, the result is the reason why
     it is not explained.
     """
-    results = {name: result for name, result in comparison.axes.items() if name != "down"}
-    if not results:
+    axis_results = {name: result for name, result in comparison.axes.items() if name != "down"}
+    if not axis_results:
         reason = "EKF2 can be replayed for horizontal positions only"
         action = "Analyse a horizontal axis, too (for example --axis north)."
         return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
-        return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
-    settings = _settings(comparison, model.inputs, corrected)
-    changed = replace(comparison.settings, **corrected)
-    runs = {
-        name: replay(axis.axis, changed, fast=True) if corrected else axis.replay
-        for name, axis in results.items()
+        return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in axis_results}
+    kf_settings = _settings(comparison, model.inputs, estimated_noises)
+    changed_settings = replace(comparison.settings, **estimated_noises)
+    kf_runs = {
+        name: replay(axis.axis, changed_settings, fast=True) if estimated_noises else axis.replay
+        for name, axis in axis_results.items()
     }
-    explanations = steps.explain_by_steps(model, settings, runs)
+    explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
-        return dict.fromkeys(results, explanations)
-    reasons = _step_reasons(replace(comparison, settings=changed), model, clock)
+        return dict.fromkeys(axis_results, explanations)
+    reasons = _step_reasons(replace(comparison, settings=changed_settings), model, clock)
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, by_steps in explanations.items():
         explanation = structs.replace(
             by_steps,
-            corrected=dict(corrected),
+            corrected=dict(estimated_noises),
             steps=tuple(
                 step for step in by_steps.steps if step.position_moved_m > MIN_STEP_EFFECT_M
             ),
-            outside=_unreplayed_part(results[name], runs[name], by_steps.spans_s),
+            outside=_unreplayed_part(axis_results[name], kf_runs[name], by_steps.spans_s),
         )
-        explanation_by_axis[name] = add_sentences(explanation, results[name].axis.label, reasons)
+        explanation_by_axis[name] = add_sentences(
+            explanation, axis_results[name].axis.label, reasons
+        )
     return explanation_by_axis
 
 
@@ -102,10 +103,10 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
         ("sigma_a_m_s2", axis_tuning.sigma_a_two_state),
         ("sigma_z_m", axis_tuning.sigma_z),
     ):
-        chosen = getattr(comparison.settings, name)
-        if noise.value is None or chosen == getattr(Settings(), name):
+        chosen_value = getattr(comparison.settings, name)
+        if noise.value is None or chosen_value == getattr(Settings(), name):
             continue
-        if max(chosen / noise.value, noise.value / chosen) >= MIN_SETTING_RATIO:
+        if max(chosen_value / noise.value, noise.value / chosen_value) >= MIN_SETTING_RATIO:
             corrected[name] = float(f"{noise.value:.3g}")
     return corrected
 
@@ -130,17 +131,21 @@ def _unreplayed_part(
 ) -> UnreplayedDifference | None:
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return None
-    state = result.ekf2_state[~inside_spans(result.ekf2_state.index, spans)]
-    times = state.index.to_numpy()
-    distance_m = np.abs(state_at(kf_run, times)[0] - state["position_m"].to_numpy())
+    unreplayed_state = result.ekf2_state[~inside_spans(result.ekf2_state.index, spans)]
+    unreplayed_s = unreplayed_state.index.to_numpy()
+    distance_m = np.abs(
+        state_at(kf_run, unreplayed_s)[0] - unreplayed_state["position_m"].to_numpy()
+    )
     if not np.isfinite(distance_m).any():
         return None
-    largest = int(np.nanargmax(distance_m))
-    return UnreplayedDifference(float(distance_m[largest]), float(times[largest]))
+    largest_index = int(np.nanargmax(distance_m))
+    return UnreplayedDifference(
+        float(distance_m[largest_index]), float(unreplayed_s[largest_index])
+    )
 
 
 def add_sentences(
-    explanation: DifferenceExplanation, axis_label: str, reasons: dict[str, str]
+    explanation: DifferenceExplanation, axis_label: str, step_reasons: dict[str, str]
 ) -> DifferenceExplanation:
     """Add sentences on the causes of the difference KF - EKF2, largest first.
 
@@ -149,33 +154,36 @@ def add_sentences(
     explanation : DifferenceExplanation
     axis_label : str
         For example "the main axis".
-    reasons : dict
+    step_reasons : dict
         Different behaviour of KF and EKF2, by the name of the replaced property.
     """
-    reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
+    step_reasons = {
+        **step_reasons,
+        steps.GATE: f"{step_reasons[steps.GATE]}{_rejection_text(explanation)}",
+    }
     largest_step, second_step, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
     )
-    cause = (
+    cause_text = (
         f"Largest contribution to the difference KF - EKF2 along {axis_label}: "
-        f"{largest_step.name}. {reasons[largest_step.name]}."
+        f"{largest_step.name}. {step_reasons[largest_step.name]}."
     )
     sentences = []
     if explanation.corrected:
-        settings = " and ".join(
+        settings_text = " and ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
         )
         sentences.append(
-            f"KF is first run again with the estimated noise ({settings}). The following "
+            f"KF is first run again with the estimated noise ({settings_text}). The following "
             "sentences explain the remaining difference KF - EKF2."
         )
-    sentences.append(f"{cause} {_effect_text(largest_step, explanation)}")
+    sentences.append(f"{cause_text} {_effect_text(largest_step, explanation)}")
     if (
         second_step.position_mean_square_m2
         >= MIN_NOTABLE_FRACTION * explanation.position_mean_square_m2
     ):
         sentences.append(
-            f"Second largest contribution: {second_step.name}. {reasons[second_step.name]}. "
+            f"Second largest contribution: {second_step.name}. {step_reasons[second_step.name]}. "
             f"{_effect_text(second_step, explanation)}"
         )
     sentences += [_unexplained_sentence(explanation), *_truth_sentences(explanation)]
@@ -188,17 +196,17 @@ def add_sentences(
             f"of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
-    return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
+    return structs.replace(explanation, sentences=tuple(sentences), cause=cause_text)
 
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
-    fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
+    explained_share = step.position_mean_square_m2 / explanation.position_mean_square_m2
     # all fractions add up to 100 %
-    opposite = "; other properties of EKF2 increase it" if fraction > 1.0 else ""
+    increase_text = "; other properties of EKF2 increase it" if explained_share > 1.0 else ""
     return (
         f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
         f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
-        f"{100 * fraction:.0f} %{opposite}."
+        f"{100 * explained_share:.0f} %{increase_text}."
     )
 
 
@@ -206,10 +214,10 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""
-    samples = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
+    count_text = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
     return (
-        f". From {rejection_run.start_s:.0f} s on EKF2 rejected {samples} in a row; its position "
-        f"drifted by {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
+        f". From {rejection_run.start_s:.0f} s on EKF2 rejected {count_text} in a row; its "
+        f"position drifted by {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
     )
 
 
@@ -217,7 +225,7 @@ def _step_reasons(
     comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
     settings, inputs, source = comparison.settings, model.inputs, comparison.source
-    flown, aid = inputs.settings, inputs.aid
+    ekf2_parameters, aid = inputs.settings, inputs.aid
     samples_text = (
         f"KF predicts every {settings.dt_s:g} s from its first position; EKF2 predicts every "
         f"{1e3 * inputs.step_s:.0f} ms"
@@ -228,18 +236,18 @@ def _step_reasons(
         samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
     age_ms = 1e3 * (source.age_s - settings.clock_offset_s)
     delay_text = (
-        f"EKF2 assumes that positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF "
+        f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {age_ms:.0f} ms"
     )
     if isinstance(clock, ClockOffset) and clock.is_determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
-        ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
+        ml_delay_ms, low_ms, high_ms = (1e3 * (source.age_s - offset_s) for offset_s in ends_s)
         delay_text += (
             f". The maximum-likelihood estimate of this delay is {ml_delay_ms:.0f} ms (95 % "
-            f"{low:.0f} to {high:.0f} ms)"
+            f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
-    equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    trusted = "IMU" if equivalent_sigma_a < settings.sigma_a_m_s2 else "positions"
+    equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
+    trusted_input = "IMU" if equivalent_sigma_a < settings.sigma_a_m_s2 else "positions"
     return {
         steps.SAMPLES: samples_text,
         steps.TIMESTAMPS: delay_text,
@@ -249,9 +257,9 @@ def _step_reasons(
         ),
         steps.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS: (
-            f"EKF2_ACC_NOISE {flown['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
+            f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
             f"{equivalent_sigma_a:.2g} m/s²; KF uses {settings.sigma_a_m_s2:.2g} m/s². "
-            f"EKF2 gives the {trusted} more weight than KF"
+            f"EKF2 gives the {trusted_input} more weight than KF"
         ),
         steps.ATTITUDE: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
@@ -268,25 +276,29 @@ def _step_reasons(
         ),
         steps.OUTPUT: (
             f"EKF2 fuses positions {1e3 * inputs.horizon_s:.0f} ms late, and its output predictor "
-            f"(EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s) predicts the present state; KF has no "
-            "delay"
+            f"(EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) predicts the present state; "
+            "KF has no delay"
         ),
     }
 
 
 def _unexplained_sentence(explanation: DifferenceExplanation) -> str:
-    position, velocity = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
+    position_m2, velocity_m2_s2 = (
+        explanation.position_mean_square_m2,
+        explanation.velocity_mean_square_m2_s2,
+    )
     position_percent, velocity_percent = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
             explanation.unexplained_fraction,
-            explanation.unexplained_velocity_mean_square_m2_s2 / velocity,
+            explanation.unexplained_velocity_mean_square_m2_s2 / velocity_m2_s2,
         )
     )
     return (
-        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(velocity):.3f} m/s. The replay does not explain {position_percent} of the mean "
-        f"square position difference and {velocity_percent} of the mean square velocity difference."
+        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position_m2):.3f} m and "
+        f"{np.sqrt(velocity_m2_s2):.3f} m/s. The replay does not explain {position_percent} of the "
+        f"mean square position difference and {velocity_percent} of the "
+        "mean square velocity difference."
     )
 
 
@@ -303,10 +315,17 @@ def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
         kf_rmse_m,
         *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps),
     ]
-    changes, names = np.diff(np.square(rmse_by_step)), [step.name for step in explanation.steps]
-    step_index = int(np.argmin(changes) if ekf2_rmse_m < kf_rmse_m else np.argmax(changes))
+    mean_square_changes, step_names = (
+        np.diff(np.square(rmse_by_step)),
+        [step.name for step in explanation.steps],
+    )
+    step_index = int(
+        np.argmin(mean_square_changes)
+        if ekf2_rmse_m < kf_rmse_m
+        else np.argmax(mean_square_changes)
+    )
     before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. The replacement that "
-        f"changes the RMSE most: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
+        f"changes the RMSE most: {step_names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
     ]

@@ -22,7 +22,7 @@ from px4fuse.filter.correlated_noise import (
 )
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
-from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
+from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, SystematicErrors, fit_systematic_errors
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
@@ -40,14 +40,14 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Minimum ratio of the measured to the needed IMU rate: measured rates are up to 2 % below nominal
+# Minimum ratio of measured to nominal IMU rate: measured rates are up to 2 % lower
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # Minimum number of time offset estimates on each side of a tested change in flight
 MIN_PARTS = 2
 
-# Axes with a noise estimate in reports; north and east share one
+# Axes with a noise estimate in the report; north and east share one estimate
 REPORTED_AXES = (HORIZONTAL, "down")
 
 Progress = Callable[[str], None]
@@ -75,7 +75,7 @@ class Estimates:
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
-    bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
+    systematic_errors: SystematicErrors | Unavailable
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     tuning_by_axis: tuple[AxisTuning, ...] = ()
@@ -88,8 +88,10 @@ def ignore_progress(_: str) -> None:
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
     """Return the first noise estimate that exists, in the order of the axis names."""
-    estimates = map(tuning.get, names)
-    return next((each for each in estimates if isinstance(each, AxisTuning)), None)
+    axis_tunings = map(tuning.get, names)
+    return next(
+        (axis_tuning for axis_tuning in axis_tunings if isinstance(axis_tuning, AxisTuning)), None
+    )
 
 
 def value_or_bound(noise: Noise, fallback: float) -> float:
@@ -99,15 +101,17 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and errors of the source."""
-    names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
-    tuning, clock = estimate_noises_and_clock(comparison, progress, names)
+    tuned_axes = (
+        REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
+    )
+    tuning, clock = estimate_noises_and_clock(comparison, progress, tuned_axes)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
     source, is_odometry = comparison.source, comparison.source.orientation is not None
     return Estimates(
         tuning=tuning,
         clock=clock,
         heading=estimate_frame_rotation(comparison, tuning, clock, progress),
-        bias_scale_jump_fit=fit,
+        systematic_errors=fit,
         source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
         tuning_by_axis=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
@@ -204,7 +208,7 @@ def estimate_frame_rotation(
 def _fit_source_errors(
     comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable
 ) -> tuple[
-    BiasScaleJumpFit | Unavailable,
+    SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
@@ -216,7 +220,7 @@ def _fit_source_errors(
     offset_s = 0.0
     if isinstance(clock, ClockOffset) and clock.is_determinable:
         offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
-    fit = fit_bias_scale_jumps(
+    systematic_errors = fit_systematic_errors(
         flight,
         axes,
         settings,
@@ -226,13 +230,13 @@ def _fit_source_errors(
         clock_offset_s=offset_s,
         announced_s=reset_times_s(comparison.source).tolist(),
     )
-    jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
+    jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
     # the exact time of a jump is unknown: exclude measurements just after the jump
     time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
         excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
-    correlation = fit_time_correlation(
+    correlated_fit = fit_time_correlation(
         flight,
         axes,
         settings,
@@ -241,16 +245,16 @@ def _fit_source_errors(
         clock_offset_s=offset_s,
         jumps=jumps,
     )
-    if isinstance(correlation, Unavailable):
-        return fit, correlation, correlation
-    low_pass, correlated_noise = correlation
+    if isinstance(correlated_fit, Unavailable):
+        return systematic_errors, correlated_fit, correlated_fit
+    low_pass, correlated_noise = correlated_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
     known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
     if len(known_truths) == len(axes):
         correlated_noise = fit_time_correlation_to_truth(
             axes, known_truths, excluded_s, offset_s, jumps, correlated_noise, low_pass
         )
-    return fit, low_pass, correlated_noise
+    return systematic_errors, low_pass, correlated_noise
 
 
 def _horizontal_axes(
@@ -302,56 +306,74 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     Drift makes the estimates of different parts of the flight differ by more than noise, so the
     interval is widened by their scatter.
     """
-    offset = np.array([part.offset_s for part in clock.parts])
-    weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
-    if len(offset) <= MIN_PARTS:
+    offsets_s = np.array([part.offset_s for part in clock.parts])
+    weights = np.array([part.sigma_s**-2.0 for part in clock.parts])
+    if len(offsets_s) <= MIN_PARTS:
         return structs.replace(clock, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None)
-    sigma_factor = np.sqrt(max(1.0, _weighted_square_sum(offset, weight) / (len(offset) - 1)))
-    low, high = (
+    sigma_factor = np.sqrt(
+        max(1.0, _weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
+    )
+    low_s, high_s = (
         clock.offset_s + sigma_factor * (limit_s - clock.offset_s) for limit_s in clock.interval_s
     )
-    reason = clock.reason
-    if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        reason = (
+    drift_reason = clock.reason
+    if not drift_reason and (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
+        drift_reason = (
             "the time offset differs between parts of the flight, probably because the source "
-            f"drifts (95 % {low:+.2f} s to {high:+.2f} s)"
+            f"drifts (95 % {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
         clock,
-        interval_s=(float(low), float(high)),
+        interval_s=(float(low_s), float(high_s)),
         sigma_s=float(clock.sigma_s * sigma_factor),
-        is_determinable=not reason,
-        reason=reason,
+        is_determinable=not drift_reason,
+        reason=drift_reason,
         drift_ppm=None,
         drift_sigma_ppm=None,
-        change_p_value=_largest_step_p_value(offset, weight),
+        change_p_value=_largest_step_p_value(offsets_s, weights),
     )
 
 
-def _weighted_square_sum(offset: Array, weight: Array) -> float:
-    return float(np.sum(weight * (offset - np.average(offset, weights=weight)) ** 2))
+def _weighted_square_sum(offsets_s: Array, weights: Array) -> float:
+    return float(np.sum(weights * (offsets_s - np.average(offsets_s, weights=weights)) ** 2))
 
 
-def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
+def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset in flight; None if too short.
 
     Student's t-test of the mean offsets before and after each time, with Bonferroni correction.
     Changes below ``MIN_CHANGE_S`` are ignored.
     """
-    count = len(offset)
+    count = len(offsets_s)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)
     smallest_p = 1.0
-    for split in split_rows:
+    for split_row in split_rows:
         before_and_after = [
-            (offset[rows], weight[rows]) for rows in (slice(None, split), slice(split, None))
+            (offsets_s[rows], weights[rows])
+            for rows in (slice(None, split_row), slice(split_row, None))
         ]
-        step = float(np.diff([np.average(x, weights=w) for x, w in before_and_after])[0])
-        if abs(step) < MIN_CHANGE_S:
+        step_s = float(
+            np.diff(
+                [
+                    np.average(side_offsets_s, weights=side_weights)
+                    for side_offsets_s, side_weights in before_and_after
+                ]
+            )[0]
+        )
+        if abs(step_s) < MIN_CHANGE_S:
             continue
         variance_factor = max(
-            1.0, sum(_weighted_square_sum(x, w) for x, w in before_and_after) / (count - 2)
+            1.0,
+            sum(
+                _weighted_square_sum(side_offsets_s, side_weights)
+                for side_offsets_s, side_weights in before_and_after
+            )
+            / (count - 2),
         )
-        sigma = np.sqrt(variance_factor * sum(1.0 / np.sum(w) for _, w in before_and_after))
-        p = 2.0 * float(stdtr(count - 2, -abs(step) / sigma))
-        smallest_p = min(smallest_p, p * len(split_rows))
+        step_sigma_s = np.sqrt(
+            variance_factor
+            * sum(1.0 / np.sum(side_weights) for _, side_weights in before_and_after)
+        )
+        p_value = 2.0 * float(stdtr(count - 2, -abs(step_s) / step_sigma_s))
+        smallest_p = min(smallest_p, p_value * len(split_rows))
     return smallest_p if split_rows else None

@@ -11,9 +11,9 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, Unavailable
 
-# Minimum length of a gap in the position source, in seconds and in sample intervals: jitter and
-# single lost positions cause shorter gaps
+# Minimum length (s) of a gap in the position source: jitter causes shorter gaps
 MIN_GAP_S = 1.0
+# Minimum length of a gap in the position source, in sample intervals
 MIN_GAP_INTERVALS = 5.0
 
 
@@ -63,11 +63,11 @@ def airborne_spans(flight: Flight) -> tuple[Span, ...]:
 def collect_events(comparison: Comparison) -> Events:
     """Collect gaps, rejections and resets of a flight."""
     flight, segment = comparison.flight, comparison.segment.flight
-    low, high = segment.start_s, segment.end_s
-    time_s = np.concatenate([[low], comparison.lines[0].measurement_time_s, [high]])
+    start_s, end_s = segment.start_s, segment.end_s
+    time_s = np.concatenate([[start_s], comparison.lines[0].measurement_time_s, [end_s]])
 
     airborne = airborne_spans(flight)
-    edges = [low, *(time for span in airborne for time in span), high]
+    flight_edges_s = [start_s, *(time for span in airborne for time in span), end_s]
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=source_gaps(time_s, comparison.source.rate_hz),
@@ -77,10 +77,12 @@ def collect_events(comparison: Comparison) -> Events:
         ),
         ground=()
         if isinstance(flight.airborne, Unavailable)
-        else segment.cut(zip(edges[::2], edges[1::2], strict=True)),
-        take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
-        landing_s=tuple(end for _, end in airborne if low <= end <= high),
-        resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
+        else segment.cut(zip(flight_edges_s[::2], flight_edges_s[1::2], strict=True)),
+        take_off_s=tuple(start for start, _ in airborne if start_s <= start <= end_s),
+        landing_s=tuple(end for _, end in airborne if start_s <= end <= end_s),
+        resets_s=tuple(
+            sorted({reset.time_s for reset in resets if start_s <= reset.time_s <= end_s})
+        ),
         rejected_s={
             result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
             for result in comparison.axes.values()

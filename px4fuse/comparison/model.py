@@ -23,7 +23,7 @@ from px4fuse.core.record import (
     Vector,
 )
 from px4fuse.errors import MissingDataError, suggest_name
-from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
+from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
@@ -52,7 +52,7 @@ class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
     def is_lag_only(self) -> bool:
         """True if EKF2's errors exceed σ only because its output predictor lags."""
         nees = self.nees_position_horizon_mean
-        return nees is not None and classify_ratio(nees**0.5, "truth") != "overconfident"
+        return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"
 
 
 class FilterSummary(Consistency, frozen=True, kw_only=True):

@@ -13,9 +13,9 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum ratio of the mean NIS along north and east for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of equal time spans of a flight that are searched for a noisy one
+# Maximum number of equal flight parts that are searched for a noisy part
 MAX_PARTS = 12
-# Minimum number of measurements in each of these time spans
+# Minimum number of measurements in each flight part of the search for a noisy part
 MIN_PART_COUNT = 25
 
 
@@ -32,8 +32,8 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along north and along east, if their mean NIS differs."""
     axes = north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
-    nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
-    if len(nis) < 2 or max(nis) < MIN_AXIS_NIS_RATIO * min(nis):
+    mean_nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
+    if len(mean_nis) < 2 or max(mean_nis) < MIN_AXIS_NIS_RATIO * min(mean_nis):
         return ()
     return tuple(
         axis_tuning
@@ -67,8 +67,8 @@ def find_noisy_part(
     time_s = axes[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
     if len(time_s) < MAX_PARTS * MIN_PART_COUNT // 2:
         return None
-    count = min(MAX_PARTS, len(time_s) // MIN_PART_COUNT)
-    edges = np.linspace(0, len(time_s), count + 1).astype(int)
+    part_count = min(MAX_PARTS, len(time_s) // MIN_PART_COUNT)
+    part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
         # wrong noise settings would change the size of innovations along the flight
@@ -76,22 +76,27 @@ def find_noisy_part(
             innovations(increments, sigma_a, sigma_z, is_excluded)
             for increments in increments_by_axis
         ]
-        normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
+        normalised_sizes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
         # the median of each axis removes the difference between the axes
-        return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
+        return np.asarray(normalised_sizes / np.median(normalised_sizes, axis=1, keepdims=True))
 
     relative_sizes = relative_innovations(None)
-    part_sigma = np.array([np.median(relative_sizes[:, low:high]) for low, high in pairwise(edges)])
+    part_sigma = np.array(
+        [
+            np.median(relative_sizes[:, first_row:end_row])
+            for first_row, end_row in pairwise(part_edges)
+        ]
+    )
     is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
     first_part = int(np.argmax(is_noisy))
     end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
     if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
         return None  # the noisy time spans are not contiguous
     is_quiet = np.ones(len(time_s), bool)
-    is_quiet[edges[first_part] : edges[end_part]] = False
-    ratios = (
+    is_quiet[part_edges[first_part] : part_edges[end_part]] = False
+    sigma_ratios = (
         float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
         for relative in (relative_sizes, relative_innovations(np.isin(time_s, outlier_time_s)))
     )
-    start_s, end_s = time_s[[edges[first_part], edges[end_part] - 1]].tolist()
-    return NoisyPart(start_s, end_s, *ratios)
+    start_s, end_s = time_s[[part_edges[first_part], part_edges[end_part] - 1]].tolist()
+    return NoisyPart(start_s, end_s, *sigma_ratios)

@@ -66,38 +66,44 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         if isinstance(value, float) and not math.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     settings = requested_settings(request)
-    track, reason = choose_source(flight, request.position_source)
-    if kind := request.source_kind:
-        track = replace(track, origin=structs.replace(track.origin, kind=kind))
-    track = shift_clock(track, settings.clock_offset_s)
-    is_in_ned = track.origin.is_gnss or track.origin.path == "aligned by EKF2"
+    source_track, source_reason = choose_source(flight, request.position_source)
+    if source_kind := request.source_kind:
+        source_track = replace(
+            source_track, origin=structs.replace(source_track.origin, kind=source_kind)
+        )
+    source_track = shift_clock(source_track, settings.clock_offset_s)
+    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == "aligned by EKF2"
     is_withheld = as_sent or is_in_ned or flight.log.is_assessed
-    convention = None if is_withheld else check_convention(flight, track)
+    convention = None if is_withheld else check_convention(flight, source_track)
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
-    late_s = convention_faults(convention, flight, track.frame).late_s
+    late_s = convention_faults(convention, flight, source_track.frame).late_s
     # a time offset beyond the range of the settings is found at the edge of the searched range
-    low_s, high_s, _ = SETTING_RANGES["clock_offset_s"]
-    clock_offset_s = min(max(settings.clock_offset_s - late_s, low_s), high_s)
+    limits_s = SETTING_RANGES["clock_offset_s"][:2]
+    clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
-    flight, track = correct_convention(flight, track, convention)
-    track = _move_to_vehicle(track, flight)
-    track = _use_origin_of_gnss(track, flight)
-    track = _use_barometer_height(track, flight, request.height)
-    flight = select_innovations(flight, track)
+    flight, source_track = correct_convention(flight, source_track, convention)
+    source_track = _move_to_vehicle(source_track, flight)
+    source_track = _use_origin_of_gnss(source_track, flight)
+    source_track = _use_barometer_height(source_track, flight, request.height)
+    flight = select_innovations(flight, source_track)
     missing = flight.missing
-    segment = choose_segment(flight, track, request.start_s, request.end_s)
-    names = request.axes or (GNSS_AXES if track.origin.fused_as_gnss else None)
-    lines = make_axes(flight, track, segment, names=names, heading_deg=request.heading_deg)
-    if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
+    segment = choose_segment(flight, source_track, request.start_s, request.end_s)
+    axis_names = request.axes or (GNSS_AXES if source_track.origin.fused_as_gnss else None)
+    compared_axes = make_axes(
+        flight, source_track, segment, names=axis_names, heading_deg=request.heading_deg
+    )
+    if isinstance(flight.truth, Truth) and flight.truth.name == source_track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
-    notes = (*flight.log.notes, *track.notes)
-    if track.origin.fused_as_gnss and request.sigma_z_m is None:
+    notes = (*flight.log.notes, *source_track.notes)
+    if source_track.origin.fused_as_gnss and request.sigma_z_m is None:
         default_m = PARAMETERS[GNSS_POS.noise].default
-        sigma_z_m = observation_variance(flight, track, lines[0], segment, default_m) ** 0.5
+        sigma_z_m = (
+            observation_variance(flight, source_track, compared_axes[0], segment, default_m) ** 0.5
+        )
         if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
-    acceleration = lines[0].acceleration
+    acceleration = compared_axes[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if request.input == "imu":
             raise SettingsError(
@@ -107,7 +113,15 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
     return Comparison(
-        flight, track, reason, segment, settings, lines, notes, missing, convention=convention
+        flight,
+        source_track,
+        source_reason,
+        segment,
+        settings,
+        compared_axes,
+        notes,
+        missing,
+        convention=convention,
     )
 
 
@@ -120,12 +134,14 @@ def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )
-    missing = tuple(
+    missing_innovations = tuple(
         item for item in flight.missing if not item.source and item not in missing_vision
     )
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
-    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _missing_innovations(ekf2))
+    return replace(
+        flight, ekf2=ekf2, streams=streams, missing=missing_innovations + _missing_innovations(ekf2)
+    )
 
 
 def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
@@ -152,11 +168,12 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
-    names = [track.name for track in flight.positions]
-    reasons = {missing.source: missing.reason for missing in flight.missing}
+    track_names = [track.name for track in flight.positions]
+    missing_reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
-        f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
-        f"{suggest_name(name, names)}Position sources in this log: {', '.join(names) or 'none'}.",
+        f"{flight.log.name}: position source {name}: {missing_reasons.get(name, 'no such source')}",
+        f"{suggest_name(name, track_names)}Position sources in this log: "
+        f"{', '.join(track_names) or 'none'}.",
     )
 
 
@@ -172,11 +189,11 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned
     forward, right, down = track.lever_arm_m
-    note = (
+    lever_arm_note = (
         "positions converted from the sensor to the vehicle's origin by the lever arm "
         f"{forward:g} m forward, {right:g} m right, {down:g} m down (from EKF2 parameters)"
     )
-    return replace(track, samples=samples, notes=(*track.notes, note))
+    return replace(track, samples=samples, notes=(*track.notes, lever_arm_note))
 
 
 def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
@@ -196,11 +213,11 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
         return track
     samples[Columns.POSITION] -= offset_m
     north, east, down = offset_m
-    note = (
+    origin_note = (
         f"the median offset of {track.name} from EKF2 ({north:.1f} m north, {east:.1f} m east, "
         f"{down:.1f} m down) is removed: EKF2 estimates this offset while it fuses GNSS"
     )
-    return replace(track, samples=samples, notes=(*track.notes, note))
+    return replace(track, samples=samples, notes=(*track.notes, origin_note))
 
 
 def _use_barometer_height(
@@ -231,12 +248,12 @@ def _use_barometer_height(
         if np.isfinite(ekf2_down_m).any():
             zero_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
         zero_text = "the median of EKF2's height"
-    note = f"heights are from the barometer; height 0 is {zero_text}"
+    height_note = f"heights are from the barometer; height 0 is {zero_text}"
     return replace(
         track,
         barometer=heights - zero_m,
         description=f"{track.description}, barometer height",
-        notes=(*track.notes, note),
+        notes=(*track.notes, height_note),
     )
 
 
@@ -253,8 +270,11 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         ulog_text = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the position file of the positioning system with `position`{ulog_text}."
     if flight.positions:
-        name = flight.positions[0].name
-        remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
+        track_name = flight.positions[0].name
+        remedy = (
+            f"use {track_name}, which EKF2 did not fuse (--position-source {track_name}), "
+            f"or {remedy}"
+        )
     reason = f"{damage_text}no external position in this log (no {topics})"
     height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
     if height_only is not None:
@@ -309,47 +329,53 @@ def choose_segment(
     """
     source_span_s = track.samples.index[[0, -1]].tolist()
     first_s, last_s = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
-    low, high = first_s, last_s
+    flight_start_s, flight_end_s = first_s, last_s
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the position source (no land detector in the log)"
     elif not flight.airborne:
         reason = "whole duration of the position source (the vehicle never took off)"
     else:
         flights = join_flights(flight.airborne)
-        low, high = max(flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s))
+        flight_start_s, flight_end_s = max(
+            flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s)
+        )
         reason = "positions available and vehicle airborne"
         if len(flights) > 1:
             others_text = ", ".join(
                 f"{start:.1f} to {end:.1f} s (--start {start:.1f} --end {end:.1f})"
                 for start, end in flights
-                if start != low
+                if start != flight_start_s
             )
             reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
-        if not max(low, first_s) < min(high, last_s):
-            low, high = min(low, first_s), max(high, last_s)
+        if not max(flight_start_s, first_s) < min(flight_end_s, last_s):
+            flight_start_s, flight_end_s = min(flight_start_s, first_s), max(flight_end_s, last_s)
             reason = "whole duration of the position source (no positions in flight)"
     if start_s is not None or end_s is not None:
-        low, high = low if start_s is None else start_s, high if end_s is None else end_s
-        options = {"--start": start_s, "--end": end_s}
-        reason = f"chosen with {' and '.join(o for o, s in options.items() if s is not None)}"
-        clipped_s = max(low, 0.0), min(high, flight.log.duration_s)
-        if clipped_s != (low, high) and clipped_s[0] < clipped_s[1]:
-            low, high = clipped_s
-            reason += ", limited to the logged time"
-    if not low < high:
-        raise SettingsError(
-            f"{flight.log.name}: no positions between {low:.6g} s and {high:.6g} s; the position "
-            f"source runs from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
-            "--start or --end."
+        flight_start_s, flight_end_s = (
+            flight_start_s if start_s is None else start_s,
+            flight_end_s if end_s is None else end_s,
         )
-    start, end = max(low, first_s), min(high, last_s)
-    if start >= end:
-        start, end = low, high
-    segment = Segment(start, end, reason, (low, high))
-    count = len(cut_to_segment(track.samples, segment))
-    if count < MIN_MEASUREMENTS:
+        time_options = {"--start": start_s, "--end": end_s}
+        given_options = [option for option, time_s in time_options.items() if time_s is not None]
+        reason = f"chosen with {' and '.join(given_options)}"
+        clipped_s = max(flight_start_s, 0.0), min(flight_end_s, flight.log.duration_s)
+        if clipped_s != (flight_start_s, flight_end_s) and clipped_s[0] < clipped_s[1]:
+            flight_start_s, flight_end_s = clipped_s
+            reason += ", limited to the logged time"
+    if not flight_start_s < flight_end_s:
         raise SettingsError(
-            f"{flight.log.name}: {track.name} has only {count} measurements between "
+            f"{flight.log.name}: no positions between {flight_start_s:.6g} s and "
+            f"{flight_end_s:.6g} s; the position source runs from "
+            f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
+        )
+    start, end = max(flight_start_s, first_s), min(flight_end_s, last_s)
+    if start >= end:
+        start, end = flight_start_s, flight_end_s
+    segment = Segment(start, end, reason, (flight_start_s, flight_end_s))
+    position_count = len(cut_to_segment(track.samples, segment))
+    if position_count < MIN_MEASUREMENTS:
+        raise SettingsError(
+            f"{flight.log.name}: {track.name} has only {position_count} measurements between "
             f"{segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
             f"{MIN_MEASUREMENTS} are needed. Choose a longer segment (--start, --end)."
         )

@@ -24,7 +24,7 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# Minimum number of samples that two tracks have in common, for statistics of their difference
+# Minimum number of common samples of two tracks for statistics of their difference
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -33,8 +33,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed if EKF2's median squared distance to the measurements
-# decreases to less than this fraction
+# Maximum ratio of EKF2's median squared distance to the positions without and with resets, for
+# which resets are removed
 MAX_DISTANCE_RATIO = 0.95
 
 
@@ -55,7 +55,7 @@ def continuous_state(
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
-    removed, kept = list[str](), list[str]()
+    removed_resets, kept_resets = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -69,24 +69,26 @@ def continuous_state(
         ]
         if not resets:
             continue
-        texts = kept
+        reset_texts = kept_resets
         if quantity == "position":  # velocities do not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
-            distance = partial(_median_square_distance, samples)
+            distance_to_samples = partial(_median_square_distance, samples)
             candidates = _continuous_candidates(ekf2.state[columns], resets, axes)
-            best_state = min(candidates, key=distance)
-            if distance(best_state) < MAX_DISTANCE_RATIO * distance(ekf2.state):
-                state[columns], texts = best_state, removed
-        texts.append(f"{len(resets)} of {label}")
-    statements = (
-        f"EKF2 resets {treatment}: {', '.join(texts)} ({reason})"
-        for treatment, texts, reason in (
-            ("removed", removed, "they move the origin"),
-            ("not removed", kept, "they correct an error"),
+            best_state = min(candidates, key=distance_to_samples)
+            if distance_to_samples(best_state) < MAX_DISTANCE_RATIO * distance_to_samples(
+                ekf2.state
+            ):
+                state[columns], reset_texts = best_state, removed_resets
+        reset_texts.append(f"{len(resets)} of {label}")
+    reset_statements = (
+        f"EKF2 resets {treatment}: {', '.join(reset_texts)} ({reason})"
+        for treatment, reset_texts, reason in (
+            ("removed", removed_resets, "they move the origin"),
+            ("not removed", kept_resets, "they correct an error"),
         )
-        if texts
+        if reset_texts
     )
-    return state, "; ".join(statements)
+    return state, "; ".join(reset_statements)
 
 
 def _continuous_candidates(
@@ -113,10 +115,12 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project positions, velocities and variances onto an axis."""
     rows = cut_to_segment(frame, segment)
-    available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
+    available_columns = {
+        name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame
+    }
     projected = {
-        name: weighted_sum(rows, columns, axis.direction**power)
-        for name, (columns, power) in available.items()
+        name: weighted_sum(rows, columns, axis.direction**exponent)
+        for name, (columns, exponent) in available_columns.items()
     }
     return pd.DataFrame(projected, index=rows.index)
 
@@ -149,10 +153,14 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
         samples = cut_to_segment(aid.samples, segment)
         position, variance = (
             sum(
-                weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
+                weights[name] ** exponent
+                * (samples[f"{measured_name}_{name}"] - samples[f"{deviation_name}_{name}"])
                 for name in aid.axes
             )
-            for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
+            for exponent, measured_name, deviation_name in (
+                (1, "observation", "innovation"),
+                (2, "variance", "noise"),
+            )
         )
         if axis.name == "down":
             position = position + _altitude_offset_m(ekf2, position)
@@ -248,14 +256,14 @@ def observation_variance(
     noise_m = default_noise_m if aid is None else parameters.get(aid.noise, default_noise_m)
     if aid is None or math.isnan(noise_m):
         return math.nan
-    scale = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
-    configured_m2 = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
+    noise_factor = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
+    configured_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
     # EKF2 did not receive the variance in a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return configured_m2
-    reported = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
-    reported_m2 = float(np.nansum(reported.to_numpy() * axis.direction**2))
+    median_m2 = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
+    reported_m2 = float(np.nansum(median_m2.to_numpy() * axis.direction**2))
     return max(configured_m2, reported_m2)
 
 

@@ -19,9 +19,9 @@ from px4fuse.flight.model import Unavailable
 
 # Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
-# Transmission time (ms) of a position message
+# Transmission time (ms) of a position message, which EKF2_DELAY_MAX must include
 TRANSMISSION_MS = 30.0
-# Step (ms) to which EKF2_DELAY_MAX is rounded up
+# Step (ms) of the rounded EKF2_DELAY_MAX
 DELAY_MAX_STEP_MS = 50.0
 
 
@@ -45,10 +45,13 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
         ]
         # mean NIS times a fixed number: the number of evaluated samples depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
-    curvature, slope, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
-    if curvature <= 0.0:
+    quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
+    if quadratic_coefficient <= 0.0:
         return None
-    estimate_ms, sigma_ms = -0.5 * slope / curvature, curvature**-0.5
+    estimate_ms, sigma_ms = (
+        -0.5 * linear_coefficient / quadratic_coefficient,
+        quadratic_coefficient**-0.5,
+    )
     limit_ms = max(1e3 * MIN_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
     error_ms = abs(estimate_ms - model.inputs.settings[GNSS_POS.delay])
     return (estimate_ms, sigma_ms) if error_ms > limit_ms and estimate_ms >= 0.0 else None
@@ -62,7 +65,7 @@ def ml_ekf2_parameters(
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of EKF2's noise and delay parameters.
 
-    A parameter is included only if it differs significantly from the flown value. A smaller noise
+    A parameter is included only if it differs significantly from the logged value. A smaller noise
     is not included for GNSS and odometry, because innovations do not show their slow errors. Empty
     if EKF2 did not fuse the analysed source.
     """
@@ -74,7 +77,7 @@ def ml_ekf2_parameters(
         # while EKF2 fuses GNSS, the noise of vision is at least that of GNSS
         min_vision_noise_m = inputs.settings[GNSS_POS.noise]
         inputs = replace(inputs, aid=EV_POS, received=inputs.vision)
-    if not is_fused_source(comparison, inputs):
+    if not is_source_fused(comparison, inputs):
         return {}
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
@@ -91,7 +94,7 @@ def ml_ekf2_parameters(
     return changes | ml_delay_change(comparison, inputs, clock)
 
 
-def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
+def is_source_fused(comparison: Comparison, inputs: Inputs) -> bool:
     """Return True if EKF2 fused the analysed source."""
     source = comparison.source
     return source.name == inputs.received.source and source.alignment is None
@@ -106,17 +109,19 @@ def ml_delay_change(
     return {} if ml_delay_ms is None else delay_change(inputs, ml_delay_ms)
 
 
-def wrong_delay_ms(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> float | None:
-    """Return EKF2's maximum-likelihood delay (ms) if the flown one differs significantly."""
+def wrong_delay_ms(
+    comparison: Comparison, clock: ClockOffset, logged_delay_ms: float
+) -> float | None:
+    """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
     ml_delay_ms = 1e3 * (comparison.source.age_s - clock.offset_s)
-    return ml_delay_ms if clock.is_significant(1e-3 * (flown_ms - ml_delay_ms)) else None
+    return ml_delay_ms if clock.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
 
 
-def delay_limit(name: str, ml_delay_ms: float, flown_ms: float) -> str:
+def delay_limit(name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
     """Return the limit of PX4 that a delay violates, for example "exceed 300 ms"."""
     if ml_delay_ms > (maximum_ms := PARAMETERS[name].maximum):
         return f"exceed {maximum_ms:g} ms"
-    return "be negative" if round(ml_delay_ms) <= 0.0 == flown_ms else ""
+    return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
@@ -141,7 +146,7 @@ def delay_ms(comparison: Comparison) -> float | None:
 
 
 def ml_noise_change(inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
-    """Return EKF2's parameters for ``noise_m`` if the flown noise is outside the 95 % interval."""
+    """Return EKF2's parameters for ``noise_m`` if its noise is outside the 95 % interval."""
     if (ml_noise.low or 0.0) <= noise_used_m(inputs) <= (ml_noise.high or math.inf):
         return {}
     return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
@@ -165,12 +170,12 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
     Empty if the delay exceeds PX4's maximum, or if EKF2 ignores the delay parameter.
     """
-    delay = inputs.aid.delay
-    parameter = PARAMETERS[delay]
+    delay_name = inputs.aid.delay
+    parameter = PARAMETERS[delay_name]
     if delay_ms > parameter.maximum or inputs.received.uses_sender_times:
         return {}
-    changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
-    changes |= horizon_change(inputs.settings, changes[delay])
+    changes = {delay_name: max(float(round(delay_ms)), parameter.minimum)}
+    changes |= horizon_change(inputs.settings, changes[delay_name])
     return {name: value for name, value in changes.items() if value != inputs.settings[name]}
 
 
@@ -184,9 +189,9 @@ def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, fl
 
 def noise_used_m(inputs: Inputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
-    aid, flown = inputs.aid, inputs.settings
-    is_fixed = aid.noise_mode and flown[aid.noise_mode] == 1.0
-    return max(flown[aid.noise], 0.0 if is_fixed else _reported_noise_m(inputs))
+    aid, logged_parameters = inputs.aid, inputs.settings
+    is_fixed = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
+    return max(logged_parameters[aid.noise], 0.0 if is_fixed else _reported_noise_m(inputs))
 
 
 def _reported_noise_m(inputs: Inputs) -> float:
@@ -195,5 +200,7 @@ def _reported_noise_m(inputs: Inputs) -> float:
 
 def format_settings(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
-    texts = (f"{n} to {value:.3g} {PARAMETERS[n].printed_unit}" for n, value in changes.items())
-    return " and ".join(map(str.rstrip, texts))
+    parameter_texts = (
+        f"{name} to {value:.3g} {PARAMETERS[name].printed_unit}" for name, value in changes.items()
+    )
+    return " and ".join(map(str.rstrip, parameter_texts))

@@ -33,12 +33,12 @@ from px4fuse.comparison.model import (
     UntestedFilter,
 )
 from px4fuse.comparison.projection import project, project_truth
-from px4fuse.comparison.remedy import is_fused_source
+from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     DISCREPANCIES,
     FORWARD_BIAS,
-    MIN_NEES_FINDING,
+    MIN_REPORTED_NEES,
     OUTLIERS,
     RIGHT_BIAS,
     ROTATION,
@@ -68,15 +68,15 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Maximum mean NIS of innovations that look normal
+# Maximum mean NIS of innovations without visible errors
 MAX_NORMAL_NIS = 1.5
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
 )
-# Maximum ratio between a statistic (RMSE, σ ratio) of the logged EKF2 and of the replayed EKF2.
-# With a larger ratio, replays with changes are compared with the replay as flown instead of the log
+# Maximum ratio of RMSE or σ ratio between log and EKF2 replay, for a comparison of re-runs with the
+# log instead of the replay
 MAX_REPLAY_FACTOR = 1.10
 
 
@@ -101,7 +101,7 @@ def error_above_reported_sigma(
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or truth.is_lag_only or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
+    if nees < MIN_REPORTED_NEES or truth.is_lag_only or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
@@ -147,7 +147,7 @@ def rerun_filters(
     if (
         isinstance(model, Model)
         and model.agreement.good
-        and is_fused_source(comparison, model.inputs)
+        and is_source_fused(comparison, model.inputs)
     ):
         replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
 
@@ -170,14 +170,14 @@ def planned_configurations(
     comparison: Comparison, estimates: Estimates, inputs: Inputs
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`rerun_filters` will replay."""
-    if not is_fused_source(comparison, inputs):
+    if not is_source_fused(comparison, inputs):
         return []
-    flown = inputs.settings
+    logged_parameters = inputs.settings
     return [
-        FilterConfiguration({**flown, **change})
+        FilterConfiguration({**logged_parameters, **change})
         for result in comparison.axes.values()
         for change, _ in _changes_along(comparison, estimates, inputs, result)
-        if change.keys() <= flown.keys()
+        if change.keys() <= logged_parameters.keys()
     ]
 
 
@@ -261,25 +261,25 @@ def _flown_statistics(tested_filter: _Filter, result: AxisComparison) -> tuple[R
     compared_s = tested_filter.model.flown.evaluated_s
     compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
     innovations = innovations[inside_spans(innovations.index, compared_s)]
-    rejected = innovations["rejected"].dropna()
+    rejected_flags = innovations["rejected"].dropna()
     logged_statistics = _statistics(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         error_statistics(compared_state, result.ekf2_variance, result.truth),
         difference(result.replay, compared_state),
-        float((rejected > 0.0).mean()) if len(rejected) else None,
+        float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     logged_and_replayed = (
         (logged_statistics.position_rmse_m, replayed_statistics.position_rmse_m, MAX_REPLAY_FACTOR),
         (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_FACTOR**2),
         (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_FACTOR**2),
     )
-    agrees = all(
+    is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
         for logged_value, replayed_value, factor in logged_and_replayed
         if logged_value is not None
     )
-    return (logged_statistics, True) if agrees else (replayed_statistics, False)
+    return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
 
 
 def _statistics(
@@ -329,24 +329,24 @@ def _rerun_kf(
     if FORWARD_BIAS in change:
         acceleration = _acceleration_without_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
-    time_s, tuned = axis.measurement_time_s, tuning_of_axis(tuning, axis.name)
+    time_s, axis_tuning = axis.measurement_time_s, tuning_of_axis(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
-    if OUTLIERS in change and tuned is not None:
-        is_used = ~np.isin(time_s, tuned.outlier_time_s)
+    if OUTLIERS in change and axis_tuning is not None:
+        is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
     shift_s = settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
         axis,
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    run, state = replay(axis, settings, fast=True), result.ekf2_state
+    kf_run, ekf2_state = replay(axis, settings, fast=True), result.ekf2_state
     return _statistics(
-        run.updates["innovation_m"].to_numpy(),
-        run.updates["innovation_variance_m2"].to_numpy(),
-        kf_error_statistics(run, truth, state),
+        kf_run.updates["innovation_m"].to_numpy(),
+        kf_run.updates["innovation_variance_m2"].to_numpy(),
+        kf_error_statistics(kf_run, truth, ekf2_state),
         NO_DIFFERENCE
-        if is_gnss_rotation or isinstance(state, Unavailable)
-        else difference(run, state),
+        if is_gnss_rotation or isinstance(ekf2_state, Unavailable)
+        else difference(kf_run, ekf2_state),
     )
 
 
@@ -356,8 +356,10 @@ def _acceleration_without_bias(
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
         return imu
-    bias = pd.Series([change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE)
-    flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - bias)))
+    accelerometer_bias = pd.Series(
+        [change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE
+    )
+    flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
     return project_acceleration(ned_acceleration(flight), direction, comparison.segment)
 
 
@@ -366,17 +368,17 @@ def _replay_ekf2(
 ) -> Ekf2Replay:
     if not change:
         return model.flown
-    settings = {name: value for name, value in change.items() if name in PARAMETERS}
+    changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
-    excluded_s, tuned = None, tuning_of_axis(tuning, HORIZONTAL)
-    if OUTLIERS in change and tuned is not None:
-        excluded_s = tuned.outlier_time_s - comparison.settings.clock_offset_s
+    excluded_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
+    if OUTLIERS in change and axis_tuning is not None:
+        excluded_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
             excluded_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed_model, [settings], excluded_s)
+    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_s)
     return replay
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
-from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
+from px4fuse.filter.consistency import Reference, classify_sigma_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
@@ -19,28 +19,28 @@ Change = Mapping[str, float]
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum mean NEES (error of 2 reported σ) that is reported: flights without a fault stay below 3
-MIN_NEES_FINDING = 4.0
-# Maximum mean NEES after a reduction of a noise, if the filter was already overconfident
+# Minimum reported mean NEES (error of 2 reported σ): flights without a fault stay below 3
+MIN_REPORTED_NEES = 4.0
+# Maximum mean NEES after a reduction of a noise of an overconfident filter
 MAX_NEES_AFTER_CHANGE = 2.0
-# A cause has an explained_fraction of 1 ± this tolerance
+# Tolerance of the explained_fraction of a cause, which is 1 if it explains all
 CAUSE_TOLERANCE = 0.5
-# A corrected sensor fault is a sufficient cause if its explained_fraction is 1 ± this tolerance
+# Tolerance of the explained_fraction of a sensor fault as the only cause
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Two changes are combined if each has an explained_fraction of 1 ± this tolerance
-HELPFUL_TOLERANCE = 0.9
-# Keys of changes that correct a sensor fault instead of a setting
+# Tolerance of the explained_fraction of changes that are combined in one re-run
+COMBINED_CAUSE_TOLERANCE = 0.9
+# Keys of Trial.change that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# Keys that are not counted as a separate change, because another change requires them
+# Keys of Trial.change that only accompany another change
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
-# Smaller changes of a σ ratio by a re-run (as a factor) are negligible
+# Minimum factor by which a re-run with an effect changes a σ ratio
 MIN_RATIO_CHANGE = 1.10
-# Smaller relative changes of the position RMSE by a re-run are negligible
+# Minimum relative change of the position RMSE by a re-run with an effect
 MIN_RMSE_CHANGE = 0.05
-# Minimum relative reduction of the position RMSE that is an improvement
+# Minimum relative reduction of the position RMSE by a re-run that improves the position
 POSITION_IMPROVEMENT = 0.20
-# Maximum fraction of ln(error ÷ σ) that remains after a change that corrects the error
-MAX_ERROR_LEFT = 0.75
+# Maximum ratio of ln(σ ratio) after and before a re-run that corrects the error
+MAX_REMAINING_ERROR_FRACTION = 0.75
 
 
 class RunStatistics(Record, frozen=True, kw_only=True):
@@ -117,16 +117,24 @@ def _distance(trial: Trial, statistic: Statistic) -> float:
 
 def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change brings the mean NIS or mean NEES inside its limits."""
-    low, high = nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
+    low, high = (
+        nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_REPORTED_NEES)
+    )
     return low <= (trial.after.value(statistic) or np.nan) <= high
 
 
-def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
+def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change reduces the reported σ below the errors against ground truth."""
-    nees, nis, nees_after = trial.before.nees_mean, trial.before.nis_mean, trial.after.nees_mean
-    if statistic != "nis" or nis is None or nis >= 1.0 or nees_after is None:
+    nees_before, nis_before, nees_after = (
+        trial.before.nees_mean,
+        trial.before.nis_mean,
+        trial.after.nees_mean,
+    )
+    if statistic != "nis" or nis_before is None or nis_before >= 1.0 or nees_after is None:
         return False
-    return nees_after >= (MAX_NEES_AFTER_CHANGE if nees and nees > 1.0 else MIN_NEES_FINDING)
+    return nees_after >= (
+        MAX_NEES_AFTER_CHANGE if nees_before and nees_before > 1.0 else MIN_REPORTED_NEES
+    )
 
 
 def find_trials(
@@ -162,7 +170,7 @@ def find_cause(
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
         if _distance(trial, statistic) <= CAUSE_TOLERANCE
-        and not contradicts_truth(trial, statistic)
+        and not makes_overconfident(trial, statistic)
     )
     return min(causes, key=rank, default=None)
 
@@ -172,7 +180,8 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
     helpful = [
         trial
         for trial in trials
-        if statistic in trial.discrepancies and _distance(trial, statistic) < HELPFUL_TOLERANCE
+        if statistic in trial.discrepancies
+        and _distance(trial, statistic) < COMBINED_CAUSE_TOLERANCE
     ]
     helpful.sort(key=lambda trial: _distance(trial, statistic))
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
@@ -180,8 +189,12 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
 
 def distance_from_one(statistics: RunStatistics) -> float:
     """Return the sum of |ln σ ratio| against source and ground truth."""
-    means = [mean for mean in (statistics.nis_mean, statistics.nees_mean) if mean]
-    return sum(0.5 * abs(math.log(mean)) for mean in means)
+    squared_ratios = [
+        squared_ratio
+        for squared_ratio in (statistics.nis_mean, statistics.nees_mean)
+        if squared_ratio
+    ]
+    return sum(0.5 * abs(math.log(squared_ratio)) for squared_ratio in squared_ratios)
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
@@ -196,11 +209,11 @@ def preference(trial: Trial) -> tuple[bool, int, float]:
 
 def ratios(statistics: RunStatistics) -> dict[Reference, float]:
     """Return the σ ratios (actual over reported) against source and ground truth."""
-    means: dict[Reference, float | None] = {
+    squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
     }
-    return {against: math.sqrt(mean) for against, mean in means.items() if mean}
+    return {reference: math.sqrt(mean) for reference, mean in squared_ratios.items() if mean}
 
 
 def reduction(trial: Trial) -> float:
@@ -208,36 +221,42 @@ def reduction(trial: Trial) -> float:
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
-def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return (reference, σ ratio as flown, σ ratio with the change) for source and ground truth."""
-    before, after = ratios(trial.before), ratios(trial.after)
-    return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
+def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
+    """Return (reference, σ ratio before, σ ratio after the change) for source and ground truth."""
+    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
+    return [
+        (reference, ratios_before[reference], ratios_after[reference])
+        for reference in ratios_before.keys() & ratios_after.keys()
+    ]
 
 
 def becomes_consistent(trial: Trial) -> bool:
     """Return True if a re-run makes a σ ratio consistent."""
     return any(
-        classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
-        for name, before, after in ratio_pairs(trial)
+        classify_sigma_ratio(before, reference) != "consistent"
+        and classify_sigma_ratio(after, reference) == "consistent"
+        for reference, before, after in sigma_ratio_changes(trial)
     )
 
 
 def halves_discrepancy(trial: Trial) -> bool:
     """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
     return any(
-        classify_ratio(before, name) != "consistent"
+        classify_sigma_ratio(before, reference) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
-        for name, before, after in ratio_pairs(trial)
+        for reference, before, after in sigma_ratio_changes(trial)
     )
 
 
 def remains_overconfident(trial: Trial) -> bool:
     """Return True if the filter remains nearly as overconfident against ground truth as before."""
     return any(
-        name == "truth"
-        and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
-        and math.log(after) > MAX_ERROR_LEFT * math.log(before)
-        for name, before, after in ratio_pairs(trial)
+        reference == "truth"
+        and classify_sigma_ratio(before, reference)
+        == classify_sigma_ratio(after, reference)
+        == "overconfident"
+        and math.log(after) > MAX_REMAINING_ERROR_FRACTION * math.log(before)
+        for reference, before, after in sigma_ratio_changes(trial)
     )
 
 
@@ -266,20 +285,23 @@ def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
         not 1.0 / MIN_RATIO_CHANGE <= after / before <= MIN_RATIO_CHANGE
-        for _, before, after in ratio_pairs(trial)
+        for _, before, after in sigma_ratio_changes(trial)
     ):
         return True
-    before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
-    return bool(before and after and abs(after / before - 1.0) > MIN_RMSE_CHANGE)
+    rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
+    return bool(
+        rmse_before_m and rmse_after_m and abs(rmse_after_m / rmse_before_m - 1.0) > MIN_RMSE_CHANGE
+    )
 
 
 def can_improve(trial: Trial) -> bool:
     """Return True if a re-run could show an improvement.
 
-    This requires ground truth or a σ ratio that is inconsistent as flown.
+    This requires ground truth or a σ ratio that is inconsistent before the change.
     """
     return trial.before.position_rmse_m is not None or any(
-        classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
+        classify_sigma_ratio(before, reference) != "consistent"
+        for reference, before, _ in sigma_ratio_changes(trial)
     )
 
 
@@ -294,8 +316,9 @@ def improvement(trial: Trial) -> Improvement:
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
     is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
-        abs(math.log(after)) <= abs(math.log(before)) or classify_ratio(after, name) == "consistent"
-        for name, before, after in ratio_pairs(trial)
+        abs(math.log(after)) <= abs(math.log(before))
+        or classify_sigma_ratio(after, reference) == "consistent"
+        for reference, before, after in sigma_ratio_changes(trial)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

@@ -22,23 +22,23 @@ from px4fuse.core.arrays import Array, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_OFFSET_S = 10.0
-# Minimum time (s) with both positions and IMU data for a hypothesis to be scored
+# Minimum time (s) with positions and IMU data for the score of a hypothesis
 MIN_OVERLAP_S = 10.0
-# Minimum scale (m) of the horizontal residuals: IMU noise, tilt errors and interpolation
+# Minimum σ (m) of the horizontal residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_M = 0.05
-# Minimum scale (m) of the vertical residuals: IMU noise, tilt errors and interpolation
+# Minimum σ (m) of the vertical residuals: IMU noise, tilt errors and interpolation
 MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 FREEDOM = 4.0
 # Size of each length unit in metres
 UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Rotations (rad) of the frame about the vertical below this limit are misalignments
+# Maximum rotation (rad) of the frame about the vertical that is a misalignment
 SMALL_ROTATION = np.radians(8.0)
-# Larger time offsets (s) lower the prior odds of a hypothesis
+# Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION
 ROTATION_ODDS = -1.0
-# Log prior odds of a frame with a smaller estimated rotation, relative to a frame without rotation
+# Log prior odds of a frame that is rotated by less than SMALL_ROTATION, but not by zero
 SMALL_ROTATION_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_OFFSET_S
 OFFSET_ODDS = -2.0
@@ -48,20 +48,20 @@ UNIT_ODDS = -2.0
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent barometer heights
 BAROMETER_WEIGHT = 6.0
-# Larger height errors (m) count as this error: they are outliers
+# Limit (m) of height errors in the likelihood, which limits the effect of outliers
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED = 8
-# Hypotheses whose log likelihood is lower than the best one by more than this are not refined
+# Maximum log-likelihood difference from the best hypothesis for a refinement
 MAX_DEFICIT = 60.0
-# Maximum number of second differences used to refine a hypothesis
+# Maximum number of second differences in the refinement of a hypothesis
 MAX_ROWS = 1200
-# Number of Gauss-Newton iterations to refine a hypothesis
+# Number of Gauss-Newton iterations in the refinement of a hypothesis
 ITERATIONS = 7
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_STEP_S = 0.15
-# Prior precision (σ⁻²) of Hypothesis.parameters: heading drift of the gyroscopes (σ 0.05 °/s),
-# accelerometer bias (σ 0.3 m/s²)
+# Prior precision (σ⁻²) of the seven Hypothesis.parameters: heading drift of the gyroscopes (σ
+# 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
@@ -132,9 +132,9 @@ class SentPositions:
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
-        margin = round(self.max_offset_s / GRID_S)
-        grid = imu.time_s[0] + GRID_S * np.arange(-margin, len(imu.time_s) + margin)
-        return SourceMotion.of(self.time_s, self.position_m, grid)
+        margin_steps = round(self.max_offset_s / GRID_S)
+        grid_s = imu.time_s[0] + GRID_S * np.arange(-margin_steps, len(imu.time_s) + margin_steps)
+        return SourceMotion.of(self.time_s, self.position_m, grid_s)
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class Hypothesis:
 
 def without_drift(time_s: Array, drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
-    middle = float(np.mean(time_s))
-    return middle + (time_s - middle) / (1.0 + drift)
+    middle_s = float(np.mean(time_s))
+    return middle_s + (time_s - middle_s) / (1.0 + drift)
 
 
 def search(
@@ -210,64 +210,90 @@ def search(
     Empty without motion, or if positions and IMU data overlap for less than ``MIN_OVERLAP_S``.
     """
     hypotheses = []
-    for heading_from, imu in motions.items():
-        source = positions.motion(imu)
-        for candidate in find_candidates(source, imu):
-            start = replace(candidate, heading_from=heading_from)
-            hypotheses.append(refine(start, positions, source, imu))
+    for heading_from, imu_motion in motions.items():
+        source_motion = positions.motion(imu_motion)
+        for candidate in find_candidates(source_motion, imu_motion):
+            start_hypothesis = replace(candidate, heading_from=heading_from)
+            hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
             if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
-                parameters = start.parameters.copy()
+                parameters = start_hypothesis.parameters.copy()
                 parameters[1] -= candidate.remainder_rad
-                start = replace(start, parameters=parameters, has_rotation=False)
-                hypotheses.append(refine(start, positions, source, imu))
+                start_hypothesis = replace(
+                    start_hypothesis, parameters=parameters, has_rotation=False
+                )
+                hypotheses.append(refine(start_hypothesis, positions, source_motion, imu_motion))
     return sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
     )
 
 
-def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
+def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[Hypothesis]:
     """Find likely conventions on a grid of time offsets.
 
     For each unit, axes and quarter turn, only the best time offset is kept.
     """
-    source_columns = np.column_stack([source.table, source.table**2, source.is_valid])
-    imu_columns = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
-    steps = np.arange(len(source_columns) - len(imu_columns) + 1)
-    moments = np.stack([source_columns[k : k + len(imu_columns)].T @ imu_columns for k in steps])
+    source_columns = np.column_stack(
+        [source_motion.table, source_motion.table**2, source_motion.is_valid]
+    )
+    imu_columns = np.column_stack(
+        [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
+    )
+    offset_steps = np.arange(len(source_columns) - len(imu_columns) + 1)
+    moments = np.stack(
+        [source_columns[step : step + len(imu_columns)].T @ imu_columns for step in offset_steps]
+    )
     # sums of products at each time offset; index 6 is a column of ones
     has_overlap = moments[:, 6, 6] * GRID_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
-    offset_s, moments = (steps[has_overlap] - steps[-1] / 2.0) * GRID_S, moments[has_overlap]
+    offset_s, moments = (
+        (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_S,
+        moments[has_overlap],
+    )
     independent_count = moments[:, 6, 6, None, None] * (GRID_S / WINDOW_S)
     moments /= moments[:, 6:, 6:]
-    vertical, sign, a, b, handedness = np.array(FAMILIES).T
-    correlation = moments[:, a, 0] + handedness * moments[:, b, 1] + 1j * moments[:, a, 1]
-    correlation -= 1j * handedness * moments[:, b, 0]
-    source_square, unit = np.maximum(moments[:, 3:6, 6, None], 1e-12), np.array([*UNITS.values()])
+    vertical_axis, vertical_sign, axis_a, axis_b, handedness = np.array(FAMILIES).T
+    correlation = (
+        moments[:, axis_a, 0] + handedness * moments[:, axis_b, 1] + 1j * moments[:, axis_a, 1]
+    )
+    correlation -= 1j * handedness * moments[:, axis_b, 0]
+    source_square, unit_sizes_m = (
+        np.maximum(moments[:, 3:6, 6, None], 1e-12),
+        np.array([*UNITS.values()]),
+    )
     north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
     horizontal_square = (
-        unit**2 * (source_square[:, a] + source_square[:, b]) + north_square + east_square
+        unit_sizes_m**2 * (source_square[:, axis_a] + source_square[:, axis_b])
+        + north_square
+        + east_square
     )
-    horizontal_square = (horizontal_square - 2.0 * unit * np.abs(correlation)[..., None]) / 2.0
-    down_square = unit**2 * source_square[:, vertical] + imu_down_square
-    down_square -= 2.0 * unit * (sign * moments[:, vertical, 2])[..., None]
-    score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit)
+    horizontal_square = (
+        horizontal_square - 2.0 * unit_sizes_m * np.abs(correlation)[..., None]
+    ) / 2.0
+    down_square = unit_sizes_m**2 * source_square[:, vertical_axis] + imu_down_square
+    down_square -= 2.0 * unit_sizes_m * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
+    score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
     score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
     score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
-    angle = np.angle(correlation)
-    quarter = np.round(angle / (np.pi / 2.0)).astype(int) % 4
+    rotation_angle = np.angle(correlation)
+    nearest_quarter = np.round(rotation_angle / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
-    for k in range(4):
-        score_of_quarter = np.where((quarter == k)[..., None], score, -np.inf)
-        for (f, u), row in np.ndenumerate(np.argmax(score_of_quarter, axis=0)):
-            name, family = [*UNITS][u], FAMILIES[f]
+    for quarter in range(4):
+        score_of_quarter = np.where((nearest_quarter == quarter)[..., None], score, -np.inf)
+        for (family_index, unit_index), offset_index in np.ndenumerate(
+            np.argmax(score_of_quarter, axis=0)
+        ):
+            unit_name, family = [*UNITS][unit_index], FAMILIES[family_index]
             total_score = (
-                score_of_quarter[row, f, u] + family.log_odds(k) + UNIT_ODDS * (name != "m")
+                score_of_quarter[offset_index, family_index, unit_index]
+                + family.log_odds(quarter)
+                + UNIT_ODDS * (unit_name != "m")
             )
-            parameters = np.array([offset_s[row], angle[row, f], *[0.0] * 5])
-            hypotheses.append(Hypothesis(family, name, parameters, float(total_score)))
+            parameters = np.array(
+                [offset_s[offset_index], rotation_angle[offset_index, family_index], *[0.0] * 5]
+            )
+            hypotheses.append(Hypothesis(family, unit_name, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -277,14 +303,16 @@ def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
 
 
 def refine(
-    start: Hypothesis, positions: SentPositions, source: SourceMotion, imu: ImuMotion
+    start: Hypothesis, positions: SentPositions, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
-    rows = np.flatnonzero(source.is_valid)
+    rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_ROWS)]
     best, parameters = replace(start, score=-np.inf), start.parameters
     for _ in range(ITERATIONS):
-        hypothesis, step = _evaluate(replace(start, parameters=parameters), rows, source, imu)
+        hypothesis, step = _evaluate(
+            replace(start, parameters=parameters), rows, source_motion, imu_motion
+        )
         if hypothesis.score > best.score:
             best = hypothesis
         parameters = parameters + step
@@ -292,50 +320,76 @@ def refine(
 
 
 def _evaluate(
-    hypothesis: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
+    hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
-    offset_s, angle, heading_drift, clock_drift = hypothesis.parameters[:4]
-    bias, time_s = hypothesis.parameters[4:], source.time_s[rows]
+    offset_s, rotation_angle, heading_drift, clock_drift = hypothesis.parameters[:4]
+    accelerometer_bias, time_s = hypothesis.parameters[4:], source_motion.time_s[rows]
     row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
-    at = time_s - offset_s - clock_drift * (time_s - middle_s)
-    at = (at - imu.time_s[0]) / GRID_S
-    index = np.clip(np.floor(at).astype(int), 0, len(imu.time_s) - 2)
-    is_used = (at >= 0) & (at < len(imu.time_s) - 1) & imu.is_valid[index]
+    grid_position = time_s - offset_s - clock_drift * (time_s - middle_s)
+    grid_position = (grid_position - imu_motion.time_s[0]) / GRID_S
+    grid_index = np.clip(np.floor(grid_position).astype(int), 0, len(imu_motion.time_s) - 2)
+    is_used = (
+        (grid_position >= 0)
+        & (grid_position < len(imu_motion.time_s) - 1)
+        & imu_motion.is_valid[grid_index]
+    )
     independent_count = float(np.count_nonzero(is_used)) * row_s / WINDOW_S
     if independent_count * WINDOW_S < MIN_OVERLAP_S:
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
-    index, time_s = index[is_used], time_s[is_used]
+    grid_index, time_s = grid_index[is_used], time_s[is_used]
     flown_s = time_s - time_s[0]
-    fraction = (at[is_used] - index)[:, None, None]
-    table = (1.0 - fraction) * imu.table[index] + fraction * imu.table[index + 1]
-    sent, (vertical, sign, a, b, handedness) = source.table[rows[is_used]], hypothesis.family
-    unit = UNITS[hypothesis.unit]
-    rotation = unit * np.exp(1j * (angle + heading_drift * flown_s))
-    horizontal_m = rotation * (sent[:, a] + 1j * handedness * sent[:, b])
-    ned = np.column_stack([horizontal_m.real, horizontal_m.imag, unit * sign * sent[:, vertical]])
-    measured = table[..., 0] - table[..., 1:] @ bias
-    residual = ned - measured
-    squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
-    gain, sigma_m = student_score(squares[0], 2, MIN_SIGMA_M)
-    gain_down, sigma_down_m = student_score(squares[1], 1, MIN_SIGMA_DOWN_M)
-    is_known = sent.any(axis=0)  # False for the height if the source has none
-    gain += gain_down * is_known[vertical] + np.log(unit) * np.count_nonzero(is_known)
-    gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
-    weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
-    weight *= row_s / WINDOW_S
-    ned_square, product, square = (
-        float(np.sum(weight[0] @ (first * second)[:, :2]))
-        for first, second in ((ned, ned), (ned, measured), (measured, measured))
+    grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
+    imu_table = (1.0 - grid_fraction) * imu_motion.table[
+        grid_index
+    ] + grid_fraction * imu_motion.table[grid_index + 1]
+    sent_differences, (vertical_axis, vertical_sign, axis_a, axis_b, handedness) = (
+        source_motion.table[rows[is_used]],
+        hypothesis.family,
     )
-    if 0.0 in (ned_square, product, square):  # without motion the convention is unknown
+    unit_m = UNITS[hypothesis.unit]
+    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * flown_s))
+    horizontal_m = complex_rotation * (
+        sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
+    )
+    source_ned_m = np.column_stack(
+        [
+            horizontal_m.real,
+            horizontal_m.imag,
+            unit_m * vertical_sign * sent_differences[:, vertical_axis],
+        ]
+    )
+    imu_ned_m = imu_table[..., 0] - imu_table[..., 1:] @ accelerometer_bias
+    residual = source_ned_m - imu_ned_m
+    residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
+    log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
+    down_gain, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
+    is_known = sent_differences.any(axis=0)  # False for the height if the source has none
+    log_likelihood_gain += down_gain * is_known[vertical_axis] + np.log(unit_m) * np.count_nonzero(
+        is_known
+    )
+    log_likelihood_gain -= sum(
+        student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_known]
+    )
+    weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / FREEDOM)
+    weight *= row_s / WINDOW_S
+    ned_square, source_imu_product, imu_square = (
+        float(np.sum(weight[0] @ (first * second)[:, :2]))
+        for first, second in (
+            (source_ned_m, source_ned_m),
+            (source_ned_m, imu_ned_m),
+            (imu_ned_m, imu_ned_m),
+        )
+    )
+    # without motion the convention is unknown
+    if 0.0 in (ned_square, source_imu_product, imu_square):
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
-    jacobian = np.zeros((len(index), 3, len(PRECISION)))
-    jacobian[..., 0] = imu.rate_m_s[index]
+    jacobian = np.zeros((len(grid_index), 3, len(PRECISION)))
+    jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
     jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
-    jacobian[..., 4:] = table[..., 1:]
+    jacobian[..., 4:] = imu_table[..., 1:]
     is_drifting = hypothesis.heading_from != "EKF2"
     is_free = np.array(
         [True, hypothesis.has_rotation, is_drifting, hypothesis.has_clock_drift, *[True] * 3]
@@ -347,18 +401,20 @@ def _evaluate(
     weighted_columns = columns.T * weights
     normal_matrix = weighted_columns @ columns + np.diag(PRECISION[is_free] + 1e-9)
     gradient = weighted_columns @ residual.ravel() + (PRECISION * hypothesis.parameters)[is_free]
-    step = np.zeros(len(PRECISION))
-    step[is_free] = -np.linalg.solve(normal_matrix, gradient)
-    step[0] = np.clip(step[0], -MAX_STEP_S, MAX_STEP_S)
-    scored = replace(
+    parameter_step = np.zeros(len(PRECISION))
+    parameter_step[is_free] = -np.linalg.solve(normal_matrix, gradient)
+    parameter_step[0] = np.clip(parameter_step[0], -MAX_STEP_S, MAX_STEP_S)
+    scored_hypothesis = replace(
         hypothesis,
-        score=float(independent_count * gain - 0.5 * PRECISION @ hypothesis.parameters**2),
-        scale=product / square,
-        max_scale=ned_square / product,
+        score=float(
+            independent_count * log_likelihood_gain - 0.5 * PRECISION @ hypothesis.parameters**2
+        ),
+        scale=source_imu_product / imu_square,
+        max_scale=ned_square / source_imu_product,
         sigma_m=sigma_m,
         independent_count=independent_count,
     )
-    return scored, step
+    return scored_hypothesis, parameter_step
 
 
 def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[float, float]:
@@ -367,8 +423,8 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
     for _ in range(5):
         weight = (FREEDOM + dimensions) / (FREEDOM + squares / variance)
         variance = max(float(np.mean(weight * squares)) / dimensions, min_sigma**2)
-    tails = np.mean(np.log1p(squares / variance / FREEDOM))
-    score = -0.5 * (dimensions * np.log(variance) + (FREEDOM + dimensions) * tails)
+    mean_log_tail = np.mean(np.log1p(squares / variance / FREEDOM))
+    score = -0.5 * (dimensions * np.log(variance) + (FREEDOM + dimensions) * mean_log_tail)
     return float(score), float(np.sqrt(variance))
 
 

@@ -36,26 +36,26 @@ from px4fuse.trajectory.rotation import heading
 
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
-# Minimum log likelihood of a convention, relative to positions unrelated to the motion
+# Minimum log-likelihood gain of a convention over positions unrelated to the motion
 MIN_GAIN = 8.0
-# Minimum log likelihood per independent sample: of an unambiguous, and of an ambiguous convention
+# Minimum log-likelihood gain per independent sample: unambiguous, ambiguous convention
 MIN_GAIN_PER_WINDOW = (0.15, 0.4)
-# The result is doubtful if the source's distances ÷ those of the IMU are outside this range
+# Range of the scale of a convention (source's distances ÷ IMU's distances) that is not doubtful
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# The result is doubtful if the residuals exceed the noise of source and IMU by this factor
+# Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
 MAX_RESIDUAL_RATIO = 2.4
 # Position error (m) of the second differences of the IMU
 IMU_ERROR_M = 0.05
-# The logged heading is preferred to that of the gyroscopes if its log likelihood is lower by less
-# than this: it is relative to north
+# Maximum log-likelihood deficit of EKF2's heading for which it is preferred to the gyroscopes'
+# heading, because it is relative to north
 MAX_LOGGED_DEFICIT = 20.0
-# A clock drift is corrected if it increases the log likelihood by more than this
+# Minimum log-likelihood gain by a clock drift that is corrected
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Repeated positions are ignored if their fraction is below this limit
+# Maximum fraction of repeated positions that are ignored
 MAX_REPEATED_FRACTION = 0.5
-# Heights are used if at least this fraction of the positions has one
+# Minimum fraction of positions with a height for the use of heights
 MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE = 20.0
@@ -90,14 +90,14 @@ def check_convention(
     hypotheses = _search(positions, motions)
     if not hypotheses:
         return Convention(verdict="not determinable")
-    if drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
-        corrected = positions.with_clock_drift(drift)
-        with_drift = _search(corrected, motions)
+    if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
+        positions_without_drift = positions.with_clock_drift(clock_drift)
+        with_drift = _search(positions_without_drift, motions)
         if with_drift and with_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN:
-            hypotheses, positions = with_drift, corrected
+            hypotheses, positions = with_drift, positions_without_drift
         else:
-            drift = 0.0
-    convention = _decide(hypotheses, positions, drift)
+            clock_drift = 0.0
+    convention = _decide(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
     orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
@@ -113,10 +113,12 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     is_repeated = (samples.diff() == 0.0).all(axis=1)
     if is_repeated.mean() < MAX_REPEATED_FRACTION:
         samples = samples[~is_repeated]
-    heights = None
+    barometer_heights = None
     if barometer is not None:
-        heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
-    return SentPositions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
+        barometer_heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
+    return SentPositions(
+        samples.index.to_numpy(), samples.to_numpy(), max_offset_s, barometer_heights
+    )
 
 
 def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
@@ -128,49 +130,59 @@ def _search(positions: SentPositions, motions: dict[HeadingSource, ImuMotion]) -
             and hypothesis.score > hypotheses[0].score - MAX_LOGGED_DEFICIT
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION)
         ):
-            others = [other for other in hypotheses if other is not hypothesis]
-            return [replace(hypothesis, score=hypotheses[0].score), *others]
+            other_hypotheses = [other for other in hypotheses if other is not hypothesis]
+            return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
     return hypotheses
 
 
-def _decide(hypotheses: list[Hypothesis], positions: SentPositions, drift: float) -> Convention:
+def _decide(
+    hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
+) -> Convention:
     """Decide whether the best convention is unambiguous and its residuals are plausible."""
-    best = hypotheses[0]
-    rivals = [hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best)]
+    best_hypothesis = hypotheses[0]
+    other_conventions = [
+        hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
+    ]
     if not positions.position_m[:, 2].any():  # without heights, up and down fit equally well
-        rivals = [hypothesis for hypothesis in rivals if hypothesis.axes[:2] != best.axes[:2]]
-    log_odds = best.score - rivals[0].score if rivals else None
+        other_conventions = [
+            hypothesis
+            for hypothesis in other_conventions
+            if hypothesis.axes[:2] != best_hypothesis.axes[:2]
+        ]
+    log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
     verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
-    if best.score < MIN_GAIN:
+    if best_hypothesis.score < MIN_GAIN:
         verdict = "not determinable"
     elif (
-        best.score < MIN_GAIN_PER_WINDOW[is_ambiguous] * best.independent_count
-        or best.scale > MAX_SCALE
-        or best.max_scale < MIN_SCALE
-        or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO
+        best_hypothesis.score
+        < MIN_GAIN_PER_WINDOW[is_ambiguous] * best_hypothesis.independent_count
+        or best_hypothesis.scale > MAX_SCALE
+        or best_hypothesis.max_scale < MIN_SCALE
+        or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
     ):
         verdict = "doubtful"
-    x, y, z = best.axes
+    x, y, z = best_hypothesis.axes
     likely_conventions = [
         _describe(hypothesis)
-        for hypothesis in rivals
-        if hypothesis.score > best.score - MIN_LOG_ODDS
+        for hypothesis in other_conventions
+        if hypothesis.score > best_hypothesis.score - MIN_LOG_ODDS
     ]
     return Convention(
         verdict=verdict,
         x=x,
         y=y,
         z=z,
-        unit=best.unit,
-        heading_from=best.heading_from,
-        is_mirrored=best.family.is_mirrored,
-        rotation_deg=-float(np.degrees(best.remainder_rad)) * best.has_rotation,
-        late_s=best.offset_s,
-        clock_drift=drift,
-        scale=best.scale,
+        unit=best_hypothesis.unit,
+        heading_from=best_hypothesis.heading_from,
+        is_mirrored=best_hypothesis.family.is_mirrored,
+        rotation_deg=-float(np.degrees(best_hypothesis.remainder_rad))
+        * best_hypothesis.has_rotation,
+        late_s=best_hypothesis.offset_s,
+        clock_drift=clock_drift,
+        scale=best_hypothesis.scale,
         log_odds=log_odds,
-        log_likelihood_gain=best.score,
+        log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
     )
 
@@ -192,10 +204,12 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     motion.
     """
     third_differences = np.diff(positions.position_m, 3, axis=0)
-    deviation = 1.4826 * float(
+    residual_deviation = 1.4826 * float(
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
-    noise_m = UNITS[hypothesis.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+    noise_m = (
+        UNITS[hypothesis.unit] * residual_deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+    )
     return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
 
@@ -204,16 +218,20 @@ def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> 
     start_drift = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         hypotheses = [
-            (candidates[0], drift)
-            for drift in DRIFTS.tolist()
-            if (candidates := find_candidates(positions.with_clock_drift(drift).motion(imu), imu))
+            (candidates[0], clock_drift)
+            for clock_drift in DRIFTS.tolist()
+            if (
+                candidates := find_candidates(
+                    positions.with_clock_drift(clock_drift).motion(imu), imu
+                )
+            )
         ]
         best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
         best = replace(best_candidate, heading_from=best.heading_from)
         positions = positions.with_clock_drift(start_drift)
     hypothesis = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
-    drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
-    return drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
+    clock_drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
+    return clock_drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
 
 
 def _check_orientation(
@@ -226,30 +244,34 @@ def _check_orientation(
     """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
-    result = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
-    if result is None:
+    checked_orientation = check_orientation(
+        inertial, track.orientation.index.to_numpy(), quaternions
+    )
+    if checked_orientation is None:
         return None
-    convention, time_s, attitude = result
+    convention, time_s, attitude = checked_orientation
     is_known = convention.verdict in ("determined", "ambiguous") and verdict == "determined"
     if not is_known or best.family.vertical_axis != 2 or best.family.is_mirrored:
         return convention
     own_heading = np.interp(inertial.time_s, time_s, heading(attitude))
-    motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, own_heading))
-    is_covered = (motion.time_s > time_s[0] + WINDOW_S) & (motion.time_s < time_s[-1] - WINDOW_S)
-    motion = replace(motion, is_valid=motion.is_valid & is_covered)
+    imu_motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, own_heading))
+    is_covered = (imu_motion.time_s > time_s[0] + WINDOW_S) & (
+        imu_motion.time_s < time_s[-1] - WINDOW_S
+    )
+    imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
     # correct headings (°) of the x axis of the positions, given the frame of the orientation
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
     if best.family.vertical_sign > 0:
         directions_deg = [0.0]
-    for hypothesis in search(positions, {"EKF2": motion}):
+    for hypothesis in search(positions, {"EKF2": imu_motion}):
         if (hypothesis.family, hypothesis.unit, hypothesis.has_rotation) == (
             best.family,
             best.unit,
             True,
         ):
             x_deg = float(np.degrees(hypothesis.parameters[1]))
-            errors = [
+            heading_errors = [
                 (x_deg - direction_deg + 180.0) % 360.0 - 180.0 for direction_deg in directions_deg
             ]
-            return structs.replace(convention, heading_error_deg=min(errors, key=abs))
+            return structs.replace(convention, heading_error_deg=min(heading_errors, key=abs))
     return convention

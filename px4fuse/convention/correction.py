@@ -23,13 +23,15 @@ from px4fuse.flight.model import (
 )
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Smaller rotations (°) of a frame with wrong axes are not converted, but reported as heading error
+# Minimum rotation (°) that is corrected in a frame with wrong axes; a smaller one is a heading
+# error
 MIN_REMAINDER_DEG = 8.0
-# Smaller rotations (°) of a frame with right axes are not converted, but reported as heading error
+# Minimum rotation (°) that is corrected in a frame with correct axes; a smaller one is a heading
+# error
 MIN_ROTATION_DEG = 15.0
-# Smaller time offsets (s) are not corrected, but reported as time offset
+# Minimum delay (s) that is corrected with the convention; a smaller one is a time offset
 MIN_LATE_S = 0.5
-# Minimum heading error (°) of a wrong orientation, relative to the motion of the same source
+# Minimum heading difference (°) between a wrong orientation and the motion of its source
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
@@ -86,22 +88,31 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
     """Return the faults of a position source whose stated frame is ``frame``."""
     if convention is None:
         return Faults()
-    fault = _orientation_fault(convention)
+    orientation_fault = _orientation_fault(convention)
     if convention.verdict == "ambiguous":
-        ned = format_axes(FRAME_AXES["NED"], "m")
-        likely = (format_axes(convention.axes, convention.unit), *convention.alternatives)
-        is_ned_likely = any(f"{text},".startswith(f"{ned},") for text in likely)
-        return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
+        ned_text = format_axes(FRAME_AXES["NED"], "m")
+        likely_conventions = (
+            format_axes(convention.axes, convention.unit),
+            *convention.alternatives,
+        )
+        is_ned_likely = any(
+            f"{convention_text},".startswith(f"{ned_text},")
+            for convention_text in likely_conventions
+        )
+        return Faults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
-        return Faults(orientation=fault)
+        return Faults(orientation=orientation_fault)
     fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
     is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
     has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
-    has_wrong_heading = fault in ("order", "heading")
+    has_wrong_heading = orientation_fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
     # EKF2 fused the yaw of the source, so nothing in the log shows north
     has_own_heading = (
-        is_fused and is_drifting and convention.orientation is not None and fault != "copied"
+        is_fused
+        and is_drifting
+        and convention.orientation is not None
+        and orientation_fault != "copied"
     )
     is_other_drift = is_drifting and not is_fused and not has_wrong_axes
     if has_wrong_heading or has_own_heading or is_other_drift or frame == "FRD":
@@ -112,7 +123,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         has_wrong_unit=convention.unit != "m",
         late_s=convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0,
         clock_drift=convention.clock_drift,
-        orientation=fault,
+        orientation=orientation_fault,
         is_north_unknown=has_wrong_axes and has_own_heading,
     )
     return replace(faults, affects_ekf2=is_fused and (faults.of_positions or has_wrong_heading))
@@ -147,21 +158,21 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
 def correct_convention(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
-    """Convert a position source to PX4's convention.
+    """Convert a position source to axes, unit and clock of PX4.
 
-    If EKF2 fused the wrong positions, its attitude is replaced by that of the gyroscopes.
+    If EKF2 fused the unconverted positions, its attitude is replaced by that of the gyroscopes.
     """
     faults = convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
     to_ned = _matrix_to_ned_metres(convention, faults)
-    position = samples[Columns.POSITION].to_numpy() @ to_ned.T
-    variance = samples[Columns.POSITION_VARIANCE].to_numpy()
-    is_unknown = np.isnan(variance).all(axis=1, keepdims=True)
-    variance = np.where(is_unknown, np.nan, np.nan_to_num(variance) @ (to_ned**2).T)
+    position_m = samples[Columns.POSITION].to_numpy() @ to_ned.T
+    variance_m2 = samples[Columns.POSITION_VARIANCE].to_numpy()
+    is_unknown = np.isnan(variance_m2).all(axis=1, keepdims=True)
+    variance_m2 = np.where(is_unknown, np.nan, np.nan_to_num(variance_m2) @ (to_ned**2).T)
     samples = pd.DataFrame(
-        np.hstack([position, variance]),
+        np.hstack([position_m, variance_m2]),
         _corrected_times(samples.index, faults),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
@@ -187,18 +198,18 @@ def correct_convention(
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
-    scale = UNITS[convention.unit]
+    unit_m = UNITS[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        return scale * np.eye(3)
+        return unit_m * np.eye(3)
     permutation = [
         [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
     ]
     is_rotated = abs(convention.rotation_deg) > MIN_REMAINDER_DEG
-    angle = -np.radians(convention.rotation_deg) * is_rotated
-    cosine, sine = np.cos(angle), np.sin(angle)
+    rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
+    cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    return np.asarray(scale * rotation @ np.array(permutation))
+    return np.asarray(unit_m * rotation @ np.array(permutation))
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":

@@ -45,7 +45,7 @@ HIGH_PASS_S = 12.0
 LEVELLING_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-# Minimum interval (s) between two positions that is a gap
+# Minimum length (s) of a gap between two positions
 MIN_GAP_S = 0.35
 
 
@@ -92,12 +92,16 @@ class SourceMotion:
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
-        window = round(WINDOW_S / GRID_S)
-        at_s = grid_s[0] + GRID_S * np.arange(-window, len(grid_s) + window)
+        window_steps = round(WINDOW_S / GRID_S)
+        at_s = grid_s[0] + GRID_S * np.arange(-window_steps, len(grid_s) + window_steps)
         is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
         columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
-        is_valid = is_near[2 * window :] & is_near[window:-window] & is_near[: -2 * window]
-        return cls(grid_s, high_pass(second_difference(columns, window), is_valid), is_valid)
+        is_valid = (
+            is_near[2 * window_steps :]
+            & is_near[window_steps:-window_steps]
+            & is_near[: -2 * window_steps]
+        )
+        return cls(grid_s, high_pass(second_difference(columns, window_steps), is_valid), is_valid)
 
 
 @dataclass(frozen=True)
@@ -133,21 +137,27 @@ def read_inertial(flight: Flight) -> Inertial | None:
     if len(time_s) < 4 * WINDOW_S / STEP_S:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
-    steps = np.diff([np.interp(time_s, imu_s, column) for column in integral.T]).T
-    force = steps[:, :3] / STEP_S
+    imu_integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
+    integral_steps = np.diff([np.interp(time_s, imu_s, column) for column in imu_integral.T]).T
+    force_m_s2 = integral_steps[:, :3] / STEP_S
     logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    gyro_attitude = _level(_integrate_gyros(steps[:, 3:], logged_attitude), force)
+    gyro_attitude = _level(_integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2)
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
-    gaps = np.flatnonzero(imu_gaps(imu_s))
-    edges = zip([-np.inf, *imu_s[gaps + 1]], [*imu_s[gaps], np.inf], strict=True)
-    spans = (
-        (max(start, begin), min(stop, end)) for begin, end in edges for start, stop in airborne
+    gap_rows = np.flatnonzero(imu_gaps(imu_s))
+    recorded_spans_s = zip([-np.inf, *imu_s[gap_rows + 1]], [*imu_s[gap_rows], np.inf], strict=True)
+    valid_spans_s = (
+        (max(start, begin), min(stop, end))
+        for begin, end in recorded_spans_s
+        for start, stop in airborne
     )
     return Inertial(
-        time_s, force, logged_attitude, gyro_attitude, tuple(s for s in spans if s[0] < s[1])
+        time_s,
+        force_m_s2,
+        logged_attitude,
+        gyro_attitude,
+        tuple(span for span in valid_spans_s if span[0] < span[1]),
     )
 
 
@@ -157,32 +167,46 @@ def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
     The bias is the median rotation rate relative to the logged attitude, so heading resets have no
     effect.
     """
-    excess = angle_rad - to_vector(multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:]))
-    total = np.cumsum(excess, axis=0)
-    window = round(GYRO_BIAS_WINDOW_S / STEP_S)
-    bias = np.median(total[window:] - total[:-window], axis=0) / window
-    return cumulative_product(np.concatenate([logged_attitude[:1], from_vector(angle_rad - bias)]))
+    excess_rad = angle_rad - to_vector(
+        multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
+    )
+    excess_sum_rad = np.cumsum(excess_rad, axis=0)
+    window_steps = round(GYRO_BIAS_WINDOW_S / STEP_S)
+    gyro_bias_rad = (
+        np.median(excess_sum_rad[window_steps:] - excess_sum_rad[:-window_steps], axis=0)
+        / window_steps
+    )
+    return cumulative_product(
+        np.concatenate([logged_attitude[:1], from_vector(angle_rad - gyro_bias_rad)])
+    )
 
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    mean = rotate(to_matrix(attitude[:-1]), force_m_s2)
+    mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
-        mean = running_mean(mean, np.ones(len(mean), dtype=bool), round(LEVELLING_S / STEP_S))
-    up = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
-    correction = from_vector(np.cross(up, [0.0, 0.0, -1.0]))
-    return multiply(np.concatenate([correction, correction[-1:]]), attitude)
+        mean_force_m_s2 = running_mean(
+            mean_force_m_s2, np.ones(len(mean_force_m_s2), dtype=bool), round(LEVELLING_S / STEP_S)
+        )
+    vertical = mean_force_m_s2 / np.maximum(
+        np.linalg.norm(mean_force_m_s2, axis=1, keepdims=True), 1.0
+    )
+    levelling_rotation = from_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
+    return multiply(np.concatenate([levelling_rotation, levelling_rotation[-1:]]), attitude)
 
 
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     """Return the centred running mean over ``width`` rows, without invalid rows."""
     rows = np.arange(len(values))
-    low, high = np.clip(rows - width // 2, 0, None), np.clip(rows + width // 2 + 1, None, len(rows))
+    first_rows, end_rows = (
+        np.clip(rows - width // 2, 0, None),
+        np.clip(rows + width // 2 + 1, None, len(rows)),
+    )
     valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
     cumulative = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
     cumulative = np.concatenate([np.zeros_like(cumulative[:1]), cumulative])
-    sums = cumulative[high] - cumulative[low]
-    means: Array = sums[:, :-1] / np.maximum(sums[:, -1:], 1.0)
+    window_sums = cumulative[end_rows] - cumulative[first_rows]
+    means: Array = window_sums[:, :-1] / np.maximum(window_sums[:, -1:], 1.0)
     return means.reshape(values.shape)
 
 
@@ -201,21 +225,23 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
-    middle = attitude[1:] + attitude[:-1]
-    body_to_ned = to_matrix(middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    middle_attitude = attitude[1:] + attitude[:-1]
+    body_to_ned = to_matrix(
+        middle_attitude / np.linalg.norm(middle_attitude, axis=1, keepdims=True)
+    )
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position = np.zeros((len(attitude), 3, 4))
     velocity = np.cumsum(table, axis=0) * STEP_S
     np.cumsum((velocity - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
-    window, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
-    second = second_difference(position, window)[::stride]
-    time_s = inertial.time_s[window:-window][::stride]
+    window_steps, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
+    second_differences = second_difference(position, window_steps)[::stride]
+    time_s = inertial.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
         is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)
-    filtered = high_pass(second, is_valid)
+    filtered = high_pass(second_differences, is_valid)
     return ImuMotion(time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_S, axis=0))
 
 

@@ -39,15 +39,15 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DEG = 12.0
-# Smaller tilt or heading differences (°) are noise and do not improve the score
+# Minimum tilt or heading difference (°) in the score: a smaller one is noise
 MIN_DIFFERENCE_DEG = 0.7
-# Decrease of the score per second of flight and per unit of ln(difference)
+# Decrease of a convention's score per second of flight and per unit of ln(angle difference)
 SCORE_PER_S = 0.5
 # Minimum score difference between the best and the second best convention
 MIN_LOG_ODDS = 4.0
-# Maximum number of orientations that are compared with the reference
+# Maximum number of orientations that are compared with the attitude from the gyroscopes
 MAX_SAMPLES = 600
-# Minimum number of orientations in flight for a check
+# Minimum number of orientations in flight for a check of their convention
 MIN_SAMPLES = 20
 
 
@@ -76,16 +76,16 @@ def check_orientation(
     if len(rows) < MIN_SAMPLES:
         return None
     rows = rows[:: -(-len(rows) // MAX_SAMPLES)]
-    time, sent = time_s[rows], quaternion[rows]
-    sent = sent / np.linalg.norm(sent, axis=1, keepdims=True)
+    sample_s, sent_quaternions = time_s[rows], quaternion[rows]
+    sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
-        logged_attitude = interpolate(time - delay_s, inertial.time_s, inertial.logged_attitude)
-        cosine = np.clip(np.abs(np.sum(sent * logged_attitude, axis=1)), 0.0, 1.0)
+        logged_attitude = interpolate(sample_s - delay_s, inertial.time_s, inertial.logged_attitude)
+        cosine = np.clip(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0)
         if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DEG):
-            return OrientationConvention(verdict="copied"), time, sent
-    reference = interpolate(time, inertial.time_s, inertial.gyro_attitude)
+            return OrientationConvention(verdict="copied"), sample_s, sent_quaternions
+    reference_attitude = interpolate(sample_s, inertial.time_s, inertial.gyro_attitude)
     candidates = [
-        _make_candidate(time, sent, reference, order, frames, quarters)
+        _make_candidate(sample_s, sent_quaternions, reference_attitude, order, frames, quarters)
         for order, frames, quarters in product(ORDERS, FRAMES, range(4))
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
@@ -99,7 +99,7 @@ def check_orientation(
         convention = replace(convention, verdict="unrelated")
     elif best.score - second_best.score < MIN_LOG_ODDS:
         convention = replace(convention, verdict="ambiguous")
-    return convention, time, to_attitude(sent, convention)
+    return convention, sample_s, to_attitude(sent_quaternions, convention)
 
 
 def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
@@ -110,19 +110,19 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 
 
 def _make_candidate(
-    time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
+    time_s: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
-    turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
-    attitude = multiply(to_attitude(sent, convention), turn)
-    difference = np.exp(1j * (heading(attitude) - heading(reference)))
-    offset_rad = np.angle(np.mean(difference))
-    spread_rad = np.abs(np.angle(difference * np.exp(-1j * offset_rad)))
-    cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
-    tilt_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    body_rotation = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
+    attitude = multiply(to_attitude(sent, convention), body_rotation)
+    heading_difference = np.exp(1j * (heading(attitude) - heading(reference)))
+    offset_rad = np.angle(np.mean(heading_difference))
+    spread_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
+    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
+    tilt_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
     tilt_deg, heading_deg = np.degrees(np.median([tilt_rad, spread_rad], axis=1)).tolist()
     log_differences = np.log(np.maximum([tilt_deg, heading_deg], MIN_DIFFERENCE_DEG))
-    score = -SCORE_PER_S * (time[-1] - time[0]) * float(np.sum(log_differences))
+    score = -SCORE_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
     convention = replace(convention, tilt_difference_deg=tilt_deg)

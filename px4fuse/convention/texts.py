@@ -47,17 +47,19 @@ def format_axes(axes: Sequence[str], unit: str) -> str:
     return "x {}, y {}, z {}, {}".format(*axes, unit)
 
 
-def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) -> tuple[str, str]:
+def describe_axes(
+    axes: Axes, stated_frame: str, *, is_mirrored: bool, is_file: bool
+) -> tuple[str, str]:
     """Describe wrong axes of a position source or file, and the action.
 
     >>> describe_axes(("east", "north", "up"), "NED", is_mirrored=False, is_file=True)
     ('ENU read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
     """
     x, y, z = axes
-    name = next((frame for frame in FRAME_AXES if FRAME_AXES[frame] == axes), "")
-    title = f"The axes are not {stated}"
-    if name:
-        title = f"{name} {'read' if is_file else 'sent'} as {stated}"
+    frame_name = next((frame for frame in FRAME_AXES if FRAME_AXES[frame] == axes), "")
+    title = f"The axes are not {stated_frame}"
+    if frame_name:
+        title = f"{frame_name} {'read' if is_file else 'sent'} as {stated_frame}"
     elif z == "up" and is_mirrored:
         title = "z points up"
     elif axes == ("east", "north", "down"):
@@ -65,29 +67,30 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
     elif y == "up":
         title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
-    columns = dict(zip(with_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
-    ned = f"(north, east, down) = ({', '.join(columns[one] for one in FRAME_AXES['NED'])})"
-    if is_file and name:
-        return fault, f"Run again with --position-frame {name.lower()}."
+    source_axes = dict(zip(with_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
+    ned_axes = ", ".join(source_axes[direction] for direction in FRAME_AXES["NED"])
+    ned_text = f"(north, east, down) = ({ned_axes})"
+    if is_file and frame_name:
+        return fault, f"Run again with --position-frame {frame_name.lower()}."
     if is_file:
-        return fault, f"Write {ned} to the file, and run again with --position-frame ned."
-    if name == "ENU":
+        return fault, f"Write {ned_text} to the file, and run again with --position-frame ned."
+    if frame_name == "ENU":
         return fault, (
             "With MAVROS, publish the ENU positions on vision_pose/pose: MAVROS converts them to "
-            f"NED. Without MAVROS, send {ned}."
+            f"NED. Without MAVROS, send {ned_text}."
         )
-    return fault, f"Send {ned}."
+    return fault, f"Send {ned_text}."
 
 
 def describe_unit(
-    unit: Unit, positions: str, stated: str = "metres", *, is_file: bool
+    unit: Unit, positions: str, stated_unit: str = "metres", *, is_file: bool
 ) -> tuple[str, str]:
     """Describe a wrong length unit of a position source or file, and the action.
 
     >>> describe_unit("cm", "positions", is_file=True)
     ('positions are in centimetres, not in metres', 'Run again with --position-unit cm.')
     """
-    fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated}"
+    fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated_unit}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
     return fault, (
@@ -101,6 +104,8 @@ def describe_conversion(frames: str) -> str:
     >>> describe_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'
     """
-    left = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
-    right = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
-    return f"Convert the orientation: q_NED = {left}q{right}, in the order w, x, y, z."
+    left_factor = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
+    right_factor = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
+    return (
+        f"Convert the orientation: q_NED = {left_factor}q{right_factor}, in the order w, x, y, z."
+    )

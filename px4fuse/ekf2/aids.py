@@ -27,31 +27,31 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum |mean innovation| ÷ RMS innovation of a biased aiding source
+# Minimum |mean innovation| of a biased aiding source, relative to the RMS innovation
 MIN_BIAS_RATIO = 0.5
 # Minimum |mean innovation| (√S) of a biased aiding source
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
 WINDOW_S = 10.0
-# Minimum number of innovations in a window
+# Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
 # Minimum number of windows before a change of the mean normalised innovation
 MIN_WINDOWS_BEFORE = 2
 # Minimum change (√S) of the mean normalised innovation
 MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum change of the mean, in standard deviations of the means of the earlier windows
+# Minimum change of the mean innovation, in standard deviations of the earlier window means
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
 NOT_FUSED_LIMIT_S = 5.0
-# The same limit as a multiple of the logging interval, for topics with a reduced rate
+# Maximum number of logging intervals without a fused sample of an enabled aiding source
 NOT_FUSED_INTERVALS = 10.0
-# R is from a noise parameter if √R differs by less than this fraction
+# Maximum relative difference between √R and the noise parameter from which R is computed
 NOISE_TOLERANCE = 0.02
-# Minimum evaluated height (m) above ground: rotor downwash disturbs the barometer. In a low flight
-# it is half of the maximum height
+# Minimum height (m) above ground for statistics of aiding sources, because rotor downwash
+# disturbs the barometer
 MIN_HEIGHT_M = 2.0
-# Number of barometer samples in a running median, which removes noise and gusts
+# Number of barometer samples in the running median of the height
 HEIGHT_MEDIAN_SAMPLES = 11
 
 
@@ -153,12 +153,12 @@ def flight_span(flight: Flight) -> Span | Unavailable:
     start, end = longest_flight(flight.airborne)
     # use the barometer, because EKF2's height may be faulty
     if flight.barometer is not None:
-        down = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
-        height = (down.dropna().iloc[0] if down.notna().any() else 0.0) - down
-        high = height.index[height > min(MIN_HEIGHT_M, height.max() / 2.0)]
-        if len(high):
-            start = float(high[0])
-            end = float(high[-1])
+        down_m = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
+        height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
+        flying_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
+        if len(flying_s):
+            start = float(flying_s[0])
+            end = float(flying_s[-1])
     return start, end
 
 
@@ -176,79 +176,86 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
     span = flight_span(flight)
     if isinstance(span, Unavailable):
         return span
-    logs = flight.ekf2.aids
+    aid_logs = flight.ekf2.aids
     return {
-        name: _evaluate_aid(aid, logs[name], *span) for name, aid in AIDS.items() if name in logs
+        name: _evaluate_aid(aid, aid_logs[name], *span)
+        for name, aid in AIDS.items()
+        if name in aid_logs
     }
 
 
-def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
-    samples = log.samples.loc[start_s:end_s]
-    times = samples.index.to_numpy()
-    gate = _effective_gate(aid, log)
+def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> AidResult:
+    samples = aid_log.samples.loc[start_s:end_s]
+    sample_s = samples.index.to_numpy()
+    gate = _effective_gate(aid, aid_log)
     innovation, variance = (
-        samples[[f"{quantity}_{axis}" for axis in log.axes]].to_numpy()
+        samples[[f"{quantity}_{axis}" for axis in aid_log.axes]].to_numpy()
         for quantity in ("innovation", "variance")
     )
-    enabled = np.ones(len(samples), bool)
+    is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
-    if log.enabled is not None:
-        enabled = np.asarray(step_values_at(log.enabled, samples.index) > 0.0)
-        grid = pd.Index(np.arange(start_s, end_s, 0.1))
-        is_enabled = np.asarray(step_values_at(log.enabled, grid) > 0.0)
-        enabled_fraction = _fraction(is_enabled, np.ones(len(grid), bool))
+    if aid_log.enabled is not None:
+        is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
+        flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
+        is_grid_enabled = np.asarray(step_values_at(aid_log.enabled, flight_grid_s) > 0.0)
+        enabled_fraction = _fraction(is_grid_enabled, np.ones(len(flight_grid_s), bool))
     fused_logged = "fused" in samples
     is_fused: BoolArray
     is_rejected: BoolArray
     if fused_logged:
         is_fused, is_rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
-        noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
+        noise_sigma = samples[[f"noise_{axis}" for axis in aid_log.axes]].to_numpy()
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
-        is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
-        noise_median = float(np.median(np.sqrt(noise[is_fused, 0]))) if is_fused.any() else None
+        is_reset = ((innovation == 0.0) & np.isclose(variance, noise_sigma)).all(axis=1)
+        noise_median = (
+            float(np.median(np.sqrt(noise_sigma[is_fused, 0]))) if is_fused.any() else None
+        )
     else:
         is_rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
         is_reset = np.zeros(len(samples), bool)
         noise_median = None
-    is_evaluated = (is_fused | is_rejected) & enabled & ~is_reset
-    longest_gap_s = _longest_gap(times, is_fused & enabled, log, start_s, end_s)
+    is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
+    longest_gap_s = _longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
     axes = {}
-    for number, axis in enumerate(log.axes):
-        assessment = assess(innovation[is_evaluated, number], variance[is_evaluated, number], gate)
-        if not isinstance(assessment, Unavailable):
+    for axis_index, axis in enumerate(aid_log.axes):
+        consistency = assess(
+            innovation[is_evaluated, axis_index], variance[is_evaluated, axis_index], gate
+        )
+        if not isinstance(consistency, Unavailable):
             axes[axis] = AidAxis(
-                samples=assessment.count,
-                innovation_mean=assessment.innovation_mean_m,
-                innovation_std=assessment.innovation_std_m,
-                s_sqrt_median=assessment.sqrt_s_median_m,
-                nis_mean=assessment.nis_mean,
-                nis_band=assessment.nis_band,
-                sigma_ratio=assessment.sigma_ratio,
-                rejected_fraction=assessment.fraction_outside_gate,
-                bias_p=assessment.bias_p,
-                lag1_autocorrelation=assessment.lag1_autocorrelation,
-                ljung_box_p=assessment.ljung_box_p,
+                samples=consistency.count,
+                innovation_mean=consistency.innovation_mean_m,
+                innovation_std=consistency.innovation_std_m,
+                s_sqrt_median=consistency.sqrt_s_median_m,
+                nis_mean=consistency.nis_mean,
+                nis_band=consistency.nis_band,
+                sigma_ratio=consistency.sigma_ratio,
+                rejected_fraction=consistency.fraction_outside_gate,
+                bias_p=consistency.bias_p,
+                lag1_autocorrelation=consistency.lag1_autocorrelation,
+                ljung_box_p=consistency.ljung_box_p,
                 change=_largest_mean_change(
-                    times[is_evaluated],
-                    innovation[is_evaluated, number] / np.sqrt(variance[is_evaluated, number]),
+                    sample_s[is_evaluated],
+                    innovation[is_evaluated, axis_index]
+                    / np.sqrt(variance[is_evaluated, axis_index]),
                 ),
             )
     return AidResult(
         label=aid.label,
         unit=aid.unit,
-        topic=log.topics[0],
+        topic=aid_log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction(is_fused & enabled, enabled),
+        fused_fraction=_fraction(is_fused & is_enabled, is_enabled),
         fused_logged=fused_logged,
-        rejected_fraction=_fraction(is_rejected & enabled, enabled),
+        rejected_fraction=_fraction(is_rejected & is_enabled, is_enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
-        noise_from=_noise_origin(aid, log, noise_median),
+        noise_from=_noise_origin(aid, aid_log, noise_median),
         axes=axes,
-        verdict=_verdict(axes, longest_gap_s, times[is_fused & (not fused_logged)])
+        verdict=_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
         if is_evaluated.any()
         else "disabled",
     )
@@ -260,20 +267,20 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     For each window, the mean of the two windows after it is compared with the mean before it. The
     change begins in the window itself if its own mean has changed by a third of that.
     """
-    window = np.floor((time_s - time_s[0]) / WINDOW_S)
-    windows = pd.Series(normalised).groupby(window).agg(["mean", "size"])
+    window_index = np.floor((time_s - time_s[0]) / WINDOW_S)
+    windows = pd.Series(normalised).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
-    mean = windows["mean"].to_numpy()
+    window_means = windows["mean"].to_numpy()
     largest_change = None
     min_change = MIN_CHANGE_IN_SIGMA
-    for index in range(MIN_WINDOWS_BEFORE, len(mean) - 2):
-        mean_before = np.mean(mean[:index])
-        mean_change = float(np.mean(mean[index + 1 : index + 3]) - mean_before)
-        innovation_std = np.std(normalised[window < windows.index[index]])
+    for index in range(MIN_WINDOWS_BEFORE, len(window_means) - 2):
+        mean_before = np.mean(window_means[:index])
+        mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before)
+        innovation_std = np.std(normalised[window_index < windows.index[index]])
         standard_error = innovation_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
-        scatter = max(np.std(mean[:index], ddof=1), standard_error)
-        if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * scatter):
-            has_begun = abs(mean[index] - mean_before) > abs(mean_change) / 3.0
+        mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
+        if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
+            has_begun = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
             first_window = windows.index[index if has_begun else index + 1]
             largest_change = float(time_s[0] + WINDOW_S * first_window), mean_change
             min_change = abs(mean_change)
@@ -284,42 +291,48 @@ def _fraction(is_selected: BoolArray, is_in_set: BoolArray) -> float:
     return float(is_selected.sum() / max(is_in_set.sum(), 1))
 
 
-def _effective_gate(aid: Aid, log: AidLog) -> float:
+def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
     """Return EKF2's gate (√S) from the logged test ratios ν²/(gate² S), or from the parameter."""
-    axis = log.axes[0]
-    if f"ratio_{axis}" in log.samples:
-        rows = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
-        nis = rows[f"innovation_{axis}"] ** 2 / rows[f"variance_{axis}"]
-        if len(rows) and (nis > 0.0).any():
-            return float(np.sqrt(np.median(nis / rows[f"ratio_{axis}"])))
-    return max(log.parameters.get(aid.gate, aid.default_gate), 0.01)
+    axis = aid_log.axes[0]
+    if f"ratio_{axis}" in aid_log.samples:
+        rows_with_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
+        nis = rows_with_ratio[f"innovation_{axis}"] ** 2 / rows_with_ratio[f"variance_{axis}"]
+        if len(rows_with_ratio) and (nis > 0.0).any():
+            return float(np.sqrt(np.median(nis / rows_with_ratio[f"ratio_{axis}"])))
+    return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
+def _noise_origin(aid: Aid, aid_log: AidLog, noise: float | None) -> str:
     """Return the parameter whose value is √R, else the origin stated for the source."""
-    value = log.parameters.get(aid.noise)
-    if noise is None or value is None:
+    parameter_value = aid_log.parameters.get(aid.noise)
+    if noise is None or parameter_value is None:
         return "" if noise is None else aid.noise_origin
-    for expected_noise in (value, GNSS_HEIGHT_NOISE_FACTOR * value, np.sqrt(value)):
+    for expected_noise in (
+        parameter_value,
+        GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
+        np.sqrt(parameter_value),
+    ):
         if abs(noise - expected_noise) <= NOISE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
 
 
 def _longest_gap(
-    times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
+    sample_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    is_inside = (log.unknown_fusion_s > start_s) & (log.unknown_fusion_s < end_s)
-    ends = np.union1d(np.r_[start_s, times[is_fused], end_s], log.unknown_fusion_s[is_inside])
-    starts = ends[:-1]
-    is_enabled = np.ones(len(starts), bool)
-    if log.enabled is not None:
+    is_inside = (aid_log.unknown_fusion_s > start_s) & (aid_log.unknown_fusion_s < end_s)
+    gap_ends_s = np.union1d(
+        np.r_[start_s, sample_s[is_fused], end_s], aid_log.unknown_fusion_s[is_inside]
+    )
+    gap_starts_s = gap_ends_s[:-1]
+    is_enabled = np.ones(len(gap_starts_s), bool)
+    if aid_log.enabled is not None:
         # EKF2 disables an aiding source up to 1 s after the last fused sample
-        is_enabled = step_values_at(log.enabled, pd.Index(starts + 1.0)) > 0.0
-    longest_index = int(np.argmax(np.diff(ends) * is_enabled))
+        is_enabled = step_values_at(aid_log.enabled, pd.Index(gap_starts_s + 1.0)) > 0.0
+    longest_index = int(np.argmax(np.diff(gap_ends_s) * is_enabled))
     if not is_enabled[longest_index]:
         return start_s, start_s
-    return float(ends[longest_index]), float(ends[longest_index + 1])
+    return float(gap_ends_s[longest_index]), float(gap_ends_s[longest_index + 1])
 
 
 def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:

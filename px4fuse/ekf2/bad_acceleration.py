@@ -14,9 +14,11 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# Minimum innovation (√S) of one sensor for setting the flag (vert_innov_test_lim, common.h)
+# Minimum larger innovation (√S) of barometer and GNSS height for a bad acceleration
+# (vert_innov_test_lim, common.h)
 MIN_LARGER_RATIO = 3.0
-# Minimum innovation (√S) of the other sensor for setting the flag (vert_innov_test_min, common.h)
+# Minimum smaller innovation (√S) of barometer and GNSS height for a bad acceleration
+# (vert_innov_test_min, common.h)
 MIN_SMALLER_RATIO = 1.0
 
 
@@ -81,21 +83,21 @@ class BadAcceleration:
             barometer samples, then of GNSS. NaN without a sample.
         """
         # an innovation is valid until the next innovation of the same sensor
-        gnss = previous_ratios[-1]
-        barometer = np.full(len(gnss), np.nan)
-        for ratio in previous_ratios[:-1]:
-            barometer = np.where(np.isnan(ratio), barometer, ratio)
-        is_bad = _is_falling(barometer, gnss)
-        for ratio in ratios[:-1]:
-            barometer = np.where(np.isnan(ratio), barometer, ratio)
-            is_bad |= _is_falling(barometer, gnss)
-        is_bad |= _is_falling(barometer, ratios[-1])
+        gnss_ratio = previous_ratios[-1]
+        barometer_ratio = np.full(len(gnss_ratio), np.nan)
+        for sample_ratio in previous_ratios[:-1]:
+            barometer_ratio = np.where(np.isnan(sample_ratio), barometer_ratio, sample_ratio)
+        is_bad = _is_falling(barometer_ratio, gnss_ratio)
+        for sample_ratio in ratios[:-1]:
+            barometer_ratio = np.where(np.isnan(sample_ratio), barometer_ratio, sample_ratio)
+            is_bad |= _is_falling(barometer_ratio, gnss_ratio)
+        is_bad |= _is_falling(barometer_ratio, ratios[-1])
         is_bad &= ~self.follows_log
         self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_bad, time_s + self.duration_s, self.until_s)
 
 
-def _is_falling(pressure_ratio: Array, gnss_ratio: Array) -> BoolArray:
-    larger = np.maximum(pressure_ratio, gnss_ratio)
-    smaller = np.minimum(pressure_ratio, gnss_ratio)
-    return np.asarray((larger > MIN_LARGER_RATIO) & (smaller > MIN_SMALLER_RATIO))
+def _is_falling(barometer_ratio: Array, gnss_ratio: Array) -> BoolArray:
+    larger_ratio = np.maximum(barometer_ratio, gnss_ratio)
+    smaller_ratio = np.minimum(barometer_ratio, gnss_ratio)
+    return np.asarray((larger_ratio > MIN_LARGER_RATIO) & (smaller_ratio > MIN_SMALLER_RATIO))

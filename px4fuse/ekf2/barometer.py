@@ -23,32 +23,32 @@ from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 OLD_BAROMETER_HZ = 15.0
-# Maximum relative interquartile range of sample intervals that are computed from the bias variance
+# Maximum interquartile range ÷ median of barometer intervals computed from the bias variance
 MAX_INTERVAL_SCATTER = 0.1
-# Two times belong to the same sample if they differ by less than this fraction of an interval
+# Maximum time difference, as fraction of the sample interval, of times of the same sample
 MATCH_TOLERANCE = 0.3
-# Maximum number of samples between two logged rows that are reconstructed
+# Maximum number of barometer samples that are reconstructed between two logged rows
 MAX_SAMPLES_PER_ROW = 30
-# Maximum weight of a sample, which replaces missing samples beside it
-MAX_WEIGHT = 4.0
-# Minimum weight of missing samples, to avoid a division by zero
-MIN_WEIGHT = 1e-9
+# Maximum weight of a barometer sample that stands for missing neighbours
+MAX_SAMPLE_WEIGHT = 4.0
+# Minimum sum of weights of missing barometer samples, to avoid a division by zero
+MIN_WEIGHT_SUM = 1e-9
 
 
-def sample_interval_s(record: FusionRecord) -> float:
+def sample_interval_s(fusion_record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
     In the steady state, an update reduces the variance of the barometer bias as much as the random
     walk increases it between samples: p' = p - p²/S and p = p' + q² Δt.
     """
-    bias = record.height_bias.get(BAROMETER.name)
+    bias = fusion_record.height_bias.get(BAROMETER.name)
     if bias is not None and len(bias) > 1:
         variance_m2 = bias["variance_m2"] * _bias_gain(bias)
         intervals_s = (variance_m2 - bias["bias_m2"])[len(bias) // 5 :] / BIAS_DENSITY**2
-        low, median, high = np.percentile(intervals_s, [25.0, 50.0, 75.0])
-        if high - low < MAX_INTERVAL_SCATTER * median:
-            return float(median)
-    return 1.0 / (OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ)
+        low_s, median_s, high_s = np.percentile(intervals_s, [25.0, 50.0, 75.0])
+        if high_s - low_s < MAX_INTERVAL_SCATTER * median_s:
+            return float(median_s)
+    return 1.0 / (OLD_BAROMETER_HZ if fusion_record.per_step_biases else BAROMETER_HZ)
 
 
 def _bias_gain(bias: pd.DataFrame) -> Array:
@@ -60,96 +60,107 @@ def _bias_gain(bias: pd.DataFrame) -> Array:
     return np.asarray(0.5 - 0.5 * np.sqrt(np.maximum(1.0 - 4.0 * ratio, 0.0)))
 
 
-def fused_samples(ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]") -> pd.DataFrame:
+def fused_samples(
+    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]"
+) -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
 
     Columns: ``down_m`` (height) and ``weight``, which is above 1 if samples beside it are missing.
-    ``logged`` is the logged height (m, down) at measurement times.
+    ``logged_down_m`` is the logged height (m, down) at measurement times.
     """
-    interval_s = sample_interval_s(record)
-    samples = _known_and_simulated_samples(ekf2, record, logged, interval_s)
+    interval_s = sample_interval_s(fusion_record)
+    samples = _known_and_simulated_samples(ekf2, fusion_record, logged_down_m, interval_s)
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
     # each sample stands for half of the missing samples before and half of those after it
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
-    return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_WEIGHT)})
+    return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_SAMPLE_WEIGHT)})
 
 
 def _known_and_simulated_samples(
-    ekf2: Ekf2, record: FusionRecord, logged: "pd.Series[float]", interval_s: float
+    ekf2: Ekf2, fusion_record: FusionRecord, logged: "pd.Series[float]", interval_s: float
 ) -> "pd.Series[float]":
-    rows = ekf2.aids[BAROMETER.name].samples
-    if "observation_down" not in rows or len(rows) < 2:
+    logged_rows = ekf2.aids[BAROMETER.name].samples
+    if "observation_down" not in logged_rows or len(logged_rows) < 2:
         return logged
-    row_s = rows.index.to_numpy()
-    velocity = ekf2.state["down_m_s"]
-    velocity_s = velocity.index.to_numpy()
-    moved_m = cumulative_trapezoid(velocity.to_numpy(), velocity_s, initial=0)
+    row_s = logged_rows.index.to_numpy()
+    velocity_down_m_s = ekf2.state["down_m_s"]
+    velocity_s = velocity_down_m_s.index.to_numpy()
+    displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_s, initial=0)
     no_bias = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
     no_bias |= {"innovation_m": np.nan, "variance_m2": 1.0}
-    bias = record.height_bias.get(BAROMETER.name, pd.DataFrame(no_bias, index=row_s[:1]))
+    bias = fusion_record.height_bias.get(BAROMETER.name, pd.DataFrame(no_bias, index=row_s[:1]))
     # EKF2 logs the bias after the update, but fuses the sample with the bias before the update
     bias_s = np.column_stack([bias.index, bias.index + 0.5 * interval_s]).ravel()
     previous_m = bias["bias_m"] - (_bias_gain(bias) * bias["innovation_m"]).fillna(0.0)
     fused_bias_m = np.column_stack([previous_m, bias["bias_m"]]).ravel()
     # innovations in ground effect are not used: EKF2 reduces them by the dead zone
-    calm = rows[~record.was_in_state(GROUND_EFFECT, row_s)]
-    still_m = calm["observation_down"] - calm["innovation_down"]
-    still_m -= np.interp(calm.index, velocity_s, moved_m)
+    rows_outside_ground_effect = logged_rows[~fusion_record.was_in_state(GROUND_EFFECT, row_s)]
+    height_without_motion_m = (
+        rows_outside_ground_effect["observation_down"]
+        - rows_outside_ground_effect["innovation_down"]
+    )
+    height_without_motion_m -= np.interp(
+        rows_outside_ground_effect.index, velocity_s, displacement_m
+    )
 
     def bias_m(time_s: Array) -> Array:
         return np.asarray(np.interp(time_s, bias_s, fused_bias_m))
 
     def prediction_m(time_s: Array) -> Array:
         """Return EKF2's prediction of the measured height."""
-        state_m = np.interp(time_s, calm.index, still_m) + np.interp(time_s, velocity_s, moved_m)
+        state_m = np.interp(
+            time_s, rows_outside_ground_effect.index, height_without_motion_m
+        ) + np.interp(time_s, velocity_s, displacement_m)
         return np.asarray(state_m - bias_m(time_s))
 
     # arrays have one row per row of the log, and one column per sample since the previous row
     span_s = np.diff(row_s)
-    count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
-    is_regular = np.abs(span_s - count * interval_s) < MATCH_TOLERANCE * interval_s
-    is_regular &= count <= MAX_SAMPLES_PER_ROW
-    sample_s = span_s / count
-    column = np.arange(count[is_regular].max(initial=1))
-    innovation_m = np.full((len(count), len(column)), np.nan)
+    sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
+    is_regular = np.abs(span_s - sample_count * interval_s) < MATCH_TOLERANCE * interval_s
+    is_regular &= sample_count <= MAX_SAMPLES_PER_ROW
+    sample_s = span_s / sample_count
+    sample_column = np.arange(sample_count[is_regular].max(initial=1))
+    innovation_m = np.full((len(sample_count), len(sample_column)), np.nan)
     # a sample may be in several topics; later topics overwrite earlier ones
     time_s = np.concatenate([bias.index, logged.index, row_s])
     down_m = np.concatenate(
         [
             prediction_m(bias.index.to_numpy()) - bias["innovation_m"],
             logged,
-            rows["observation_down"] - bias_m(row_s),
+            logged_rows["observation_down"] - bias_m(row_s),
         ]
     )
-    row = np.searchsorted(row_s[1:], time_s - MATCH_TOLERANCE * interval_s)
-    row = np.minimum(row, len(count) - 1)
-    position_in_interval = (time_s - row_s[row]) / sample_s[row]
-    is_matched = is_regular[row] & (
+    row_index = np.searchsorted(row_s[1:], time_s - MATCH_TOLERANCE * interval_s)
+    row_index = np.minimum(row_index, len(sample_count) - 1)
+    position_in_interval = (time_s - row_s[row_index]) / sample_s[row_index]
+    is_matched = is_regular[row_index] & (
         np.abs(position_in_interval - np.rint(position_in_interval)) < MATCH_TOLERANCE
     )
     is_matched &= (position_in_interval > MATCH_TOLERANCE) & (
-        position_in_interval < count[row] + MATCH_TOLERANCE
+        position_in_interval < sample_count[row_index] + MATCH_TOLERANCE
     )
-    innovation_m[row[is_matched], np.rint(position_in_interval[is_matched]).astype(int) - 1] = (
-        down_m - prediction_m(time_s)
-    )[is_matched]
-    if "filtered_down" in rows:
+    innovation_m[
+        row_index[is_matched], np.rint(position_in_interval[is_matched]).astype(int) - 1
+    ] = (down_m - prediction_m(time_s))[is_matched]
+    if "filtered_down" in logged_rows:
         # the sign is reversed, because PX4 logs state minus measurement
-        filtered_m = -rows["filtered_down"].to_numpy()
-        age_samples = count[:, None] - 1.0 - column
+        filtered_m = -logged_rows["filtered_down"].to_numpy()
+        age_samples = sample_count[:, None] - 1.0 - sample_column
         is_missing = np.isnan(innovation_m) & (age_samples >= 0.0) & is_regular[:, None]
         innovation_m = _with_missing_innovations(
             innovation_m, is_missing, sample_s[:, None], age_samples, filtered_m
         )
-    sampled_s = row_s[:-1, None] + sample_s[:, None] * (column + 1)
+    sampled_s = row_s[:-1, None] + sample_s[:, None] * (sample_column + 1)
     has_sample = np.isfinite(innovation_m)
     sampled_s = sampled_s[has_sample]
     time_s = np.concatenate([sampled_s, time_s[~is_matched]])
     down_m = np.concatenate(
         [prediction_m(sampled_s) + innovation_m[has_sample], down_m[~is_matched]]
     )
-    samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
-    return samples[np.diff(samples.index, prepend=-np.inf) > MATCH_TOLERANCE * interval_s]
+    height_samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
+    return height_samples[
+        np.diff(height_samples.index, prepend=-np.inf) > MATCH_TOLERANCE * interval_s
+    ]
 
 
 def _with_missing_innovations(
@@ -173,13 +184,15 @@ def _with_missing_innovations(
         Low-pass filtered innovation, at the start and at each row.
     """
     new_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
-    weight = new_weight * (1.0 - new_weight) ** np.maximum(age_samples, 0.0)
-    missing_weight = weight * is_missing
+    filter_weight = new_weight * (1.0 - new_weight) ** np.maximum(age_samples, 0.0)
+    missing_weight = filter_weight * is_missing
     scatter_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    decay = (1.0 - new_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
-    known_m = np.nansum(weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(axis=1)
-    offset_m = filtered_m[1:] - decay * filtered_m[:-1] - known_m
-    offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT)
+    remaining_fraction = (1.0 - new_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
+    known_m = np.nansum(filter_weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(
+        axis=1
+    )
+    offset_m = filtered_m[1:] - remaining_fraction * filtered_m[:-1] - known_m
+    offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT_SUM)
     return np.where(is_missing, scatter_m + offset_m[:, None], innovation_m)

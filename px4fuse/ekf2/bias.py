@@ -16,9 +16,9 @@ BIAS_DENSITY = 0.13
 MIN_VARIANCE_M2 = 1e-8
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
-# If |mean of test ratio · sign of the innovation| is larger, EKF2 multiplies the random walk
-# variance by RANDOM_WALK_FACTOR (isOffsetDetected)
+# Maximum |mean of test ratio · sign of the innovation| of a correct bias (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
+# Factor on the random walk variance of the bias above MAX_MEAN_SIGNED_RATIO
 RANDOM_WALK_FACTOR = 1e3
 # Time constant (s) of the low-pass filter that averages the signed test ratio
 TEST_RATIO_FILTER_S = 10.0
@@ -60,16 +60,16 @@ class BiasEstimator:
         """
         has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
         variance_rate = np.where(has_offset, RANDOM_WALK_FACTOR * BIAS_DENSITY**2, BIAS_DENSITY**2)
-        variance = np.minimum(self.variance_m2 + variance_rate * interval_s, noise_m2)
+        bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, noise_m2)
         nu = nu + self.value_m
-        R = noise_m2 + variance
-        S = variance + (noise_m2 + predicted_variance) / weight
-        ratio = nu * nu / (BIAS_GATE**2 * S)
-        K = variance / S * (updates_bias & (ratio < 1.0))
+        R = noise_m2 + bias_variance
+        S = bias_variance + (noise_m2 + predicted_variance) / weight
+        test_ratio = nu * nu / (BIAS_GATE**2 * S)
+        K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
         self.value_m = self.value_m - K * nu
-        self.variance_m2 = np.maximum(variance - K * variance, MIN_VARIANCE_M2)
-        change = np.copysign(np.minimum(ratio, 1.0), nu) + self.mean_signed_ratio
+        self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_VARIANCE_M2)
+        ratio_change = np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_ratio
         self.mean_signed_ratio = self.mean_signed_ratio - (
-            self.filter_weight * weight * updates_bias * change
+            self.filter_weight * weight * updates_bias * ratio_change
         )
         return nu, R

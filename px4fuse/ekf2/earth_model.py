@@ -17,22 +17,24 @@ EARTH_RATE_RAD_S = 7.292115e-5
 EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 
 
-def earth_rate_rad_s(record: FusionRecord) -> Array:
+def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     """Return EKF2's earth rotation rate (rad/s, NED, shape (3,)); 0 without a known latitude."""
-    latitude = np.radians(record.latitude_deg)
-    return np.nan_to_num(EARTH_RATE_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)]))
+    latitude_rad = np.radians(fusion_record.latitude_deg)
+    return np.nan_to_num(
+        EARTH_RATE_RAD_S * np.array([np.cos(latitude_rad), 0.0, -np.sin(latitude_rad)])
+    )
 
 
-def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
+def ekf2_metres_per_metre(fusion_record: FusionRecord) -> tuple[float, float, float]:
     """Return EKF2's internal position ÷ published position along north, east and down."""
-    if np.isnan(record.latitude_deg) or not record.stores_latitude:
+    if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude:
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
-    q = 1.0 - eccentricity_squared * np.sin(np.radians(record.latitude_deg)) ** 2
+    q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
     # PX4 uses the exponent 2.5 instead of 1.5 of an ellipsoid
     radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
-        + record.altitude_m
+        + fusion_record.altitude_m
     )
-    north, east = (radii_m / EARTH_RADIUS_M).tolist()
-    return north, east, 1.0
+    north_ratio, east_ratio = (radii_m / EARTH_RADIUS_M).tolist()
+    return north_ratio, east_ratio, 1.0

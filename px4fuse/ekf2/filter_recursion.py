@@ -48,16 +48,15 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance, to avoid a division by zero
 MIN_STATE_VARIANCE = 1e-30
-# Number of events for which transition matrices are copied at once: more events need more memory
+# Number of events whose transition matrices are copied at once, which limits memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) of a measurement without effect
 IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
-# Parameters with these prefixes do not change vertical innovations, so the logged flag for a bad
-# acceleration remains valid
-NO_EFFECT_ON_HEIGHT = (
+# Prefixes of EKF2 parameters that do not change the vertical innovations
+HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_EV",
     "EKF2_MAG",
     "EKF2_OF",
@@ -65,7 +64,7 @@ NO_EFFECT_ON_HEIGHT = (
     "EKF2_GPS_P_GATE",
     "EKF2_GPS_DELAY",
 )
-# σ (m/s²) of the accelerometer bias after estimation on the ground
+# Initial σ (m/s²) of the accelerometer bias, which EKF2 has estimated on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
@@ -84,7 +83,7 @@ MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
-# State indices of velocity and position, both of which a GNSS sample measures
+# State indices of velocity and position, which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
 # Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
 VELOCITY_COLUMNS, DOWN_COLUMN = slice(0, 3), 2
@@ -127,10 +126,14 @@ class FilterConfiguration:
     without: Mapping[str, float] = field(default_factory=dict)
     timestamp_offset_s: float | None = None
 
-    def has_logged_bad_acceleration(self, inputs: Inputs) -> bool:
-        """Return True if these parameters do not change the logged flag for a bad acceleration."""
-        changed = {name for name, value in self.settings.items() if value != inputs.settings[name]}
-        has_same_heights = all(name.startswith(NO_EFFECT_ON_HEIGHT) for name in changed)
+    def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
+        """Return True if the logged flag for a bad acceleration is valid with these parameters."""
+        changed_parameters = {
+            name for name, value in self.settings.items() if value != inputs.settings[name]
+        }
+        has_same_heights = all(
+            name.startswith(HEIGHT_NEUTRAL_PREFIXES) for name in changed_parameters
+        )
         return self.uses_logged_decisions or (has_same_heights and not self.without)
 
     def timing(self, inputs: Inputs) -> Timing:
@@ -141,15 +144,15 @@ class FilterConfiguration:
         delay_names = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         max_delay_ms = max(self.settings[name] for name in delay_names)
         if inputs.rules.uses_delay_as_horizon:  # the length of the IMU buffer is the largest delay
-            length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
-            return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
+            buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
+            return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.step_s))
         # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
         longest_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        length = max(math.ceil(longest_ms * 1e-3 / inputs.predict_s), 2)
-        return Timing(delay_s, (length - 1) * inputs.step_s)
+        buffer_length = max(math.ceil(longest_ms * 1e-3 / inputs.predict_s), 2)
+        return Timing(delay_s, (buffer_length - 1) * inputs.step_s)
 
 
 @dataclass(frozen=True)
@@ -213,8 +216,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         for name in configurations[0].settings
     }
     for name, value in segment.changed.items():  # parameters that were changed in flight
-        is_flown = parameters[name] == inputs.settings[name]
-        parameters[name] = np.where(is_flown, value, parameters[name])
+        is_unchanged = parameters[name] == inputs.settings[name]
+        parameters[name] = np.where(is_unchanged, value, parameters[name])
     (
         has_biases,
         has_attitude,
@@ -250,20 +253,20 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     is_active = action > IDLE
     event_time_s = segment.time_s[event_steps]
     has_sample = np.any(is_active, axis=1).tolist()
-    enabled = {
+    is_enabled_by_aid = {
         aid.name: event_time_s
         < np.array(
             [configuration.without.get(aid.name, np.inf) for configuration in configurations]
         )
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
     }
-    can_fuse_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
-    sample = np.maximum(intervals[0].events.sample, 0)
+    can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
+    sample_index = np.maximum(intervals[0].events.sample, 0)
     measured_values, noise = _measurements(
-        inputs, segment, sample, event_steps, parameters, uses_reported_noise
+        inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
     )
     is_sequential = inputs.aid == GNSS_POS
-    has_speed = inputs.received.velocity_m_s is not None
+    has_velocity = inputs.received.velocity_m_s is not None
     gates = [
         parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
         parameters[inputs.aid.gate],
@@ -287,36 +290,46 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
         mean_samples = EventSamples(*stacked_fields)
         return mean_samples._replace(
-            sample_count=np.where(enabled[source_aid.name], mean_samples.sample_count, 0.0)
+            sample_count=np.where(
+                is_enabled_by_aid[source_aid.name], mean_samples.sample_count, 0.0
+            )
         )
 
-    ends = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
+    end_steps_by_intervals = [
+        interval_arrays.events.end_step for interval_arrays in distinct_intervals
+    ]
     if (field := segment.field) is not None:
-        field_samples = enabled_means(MAG, [mean_by_event(field, end_steps) for end_steps in ends])
+        field_samples = enabled_means(
+            MAG, [mean_by_event(field, end_steps) for end_steps in end_steps_by_intervals]
+        )
         has_field = np.asarray(field_samples.sample_count.any(axis=1))
     if (flow := segment.flow) is not None:
         flow_samples = enabled_means(
-            FLOW, [mean_by_event(flow, end_steps, segment.imu_velocity_m_s) for end_steps in ends]
+            FLOW,
+            [
+                mean_by_event(flow, end_steps, segment.imu_velocity_m_s)
+                for end_steps in end_steps_by_intervals
+            ],
         )
         has_flow = np.asarray(flow_samples.sample_count.any(axis=1))
     has_logged_flag = segment.heights is None or segment.is_acceleration_bad is None
     bad_acceleration = BadAcceleration(
         np.array(
-            [has_logged_flag or c.has_logged_bad_acceleration(inputs) for c in configurations]
+            [has_logged_flag or c.keeps_logged_bad_acceleration(inputs) for c in configurations]
         ),
         inputs.rules.bad_acceleration_s,
         segment,
     )
     if segment.heights is not None:
-        barometer = np.stack(barometer_samples(segment, ends), axis=-1)[
+        barometer_arrays = np.stack(barometer_samples(segment, end_steps_by_intervals), axis=-1)[
             ..., configuration_intervals
         ]
         heights = HeightFilter(
             segment,
-            barometer,
+            barometer_arrays,
             event_table["time_s"],
             is_active,
-            enabled,
+            is_enabled_by_aid,
             parameters,
             has_gate,
             bad_acceleration,
@@ -333,23 +346,32 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             for interval_arrays, configuration in zip(intervals, configurations, strict=True)
         ]
         vision = VisionFilter(
-            segment, vision_by_configuration, enabled, parameters, has_gate, uses_reported_noise
+            segment,
+            vision_by_configuration,
+            is_enabled_by_aid,
+            parameters,
+            has_gate,
+            uses_reported_noise,
         )
     gyro_variance = np.where(has_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     variance_increment, variance_limit = _variance_growth(
         inputs, segment, parameters, has_biases, has_attitude
     )
-    steps = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
+    step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
     acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))[
         :, :, None, None
     ]
     if (clipped_fraction := segment.clipped_fraction) is not None:
         # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
-        fraction_sums = np.diff(
+        clipped_fraction_sums = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
-        mean_fraction = (fraction_sums[:, :, None] / np.maximum(steps, 1))[..., None]
-        acceleration_variance += mean_fraction * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
+        mean_clipped_fraction = (clipped_fraction_sums[:, :, None] / np.maximum(step_counts, 1))[
+            ..., None
+        ]
+        acceleration_variance += mean_clipped_fraction * (
+            BAD_ACCELERATION_NOISE**2 - acceleration_variance
+        )
     x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
         # the log contains no bias estimate while EKF2 declared its acceleration bad: start with the
@@ -359,8 +381,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[has_bias, :, BIAS_DOWN] = 0.0
         P[has_bias, BIAS_DOWN, BIAS_DOWN] = INITIAL_BIAS_SIGMA_M_S2**2
         x[has_bias, BIAS_DOWN] = segment.mean_bias_down_m_s2
-    logged_decisions = inputs.received.rejected[sample], inputs.received.reset[sample]
-    is_aid_enabled = enabled[inputs.aid.name]
+    logged_decisions = inputs.received.rejected[sample_index], inputs.received.reset[sample_index]
+    is_aid_enabled = is_enabled_by_aid[inputs.aid.name]
     action_inputs = (
         np.where(is_aid_enabled, action, IDLE),
         event_table["can_start"] & is_aid_enabled,
@@ -376,16 +398,16 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs.received.has_all_resets,
     )
     innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
-    field_record = np.full(
+    field_results = np.full(
         (0 if field_samples is None else event_count, 3, configuration_count, 3), np.nan
     )
-    is_rejected, is_fused, reset = np.zeros((3, event_count, configuration_count), bool)
+    is_rejected, is_fused, is_reset = np.zeros((3, event_count, configuration_count), bool)
     position_reset_m = np.zeros((event_count, configuration_count, 2))
     states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
     states[0] = x
     state_variances[0] = _diagonal(P)
     innovation, R = np.empty((2, configuration_count, 4))
-    measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
+    measured_slice = slice(0 if has_velocity else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
     for e in range(event_count):
@@ -399,7 +421,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             added_noise = gyro_variance * stack_configurations("gyro_noise", event_batch)
             accelerometer_noise = stack_configurations("accelerometer_noise", event_batch)
             added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
-            variance_growth = variance_increment * steps[event_batch]
+            variance_growth = variance_increment * step_counts[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q
         x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_input[batch_index]
@@ -428,7 +450,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
             field_now = EventSamples(*(axis_values[e] for axis_values in field_samples))
-            x, P, field_record[e] = fuse_field(
+            x, P, field_results[e] = fuse_field(
                 x, P, field_now, parameters[MAG.noise], parameters[MAG.gate]
             )
         if flow_samples is not None and flow is not None and has_flow[e]:
@@ -456,7 +478,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
             is_outside_gate = is_outside_gate[:, POSITION_COLUMNS].any(axis=1)
-            is_rejected[e], is_fused[e], reset[e], is_velocity_fused = fusion.decide(
+            is_rejected[e], is_fused[e], is_reset[e], is_velocity_fused = fusion.decide(
                 e, is_outside_gate, is_velocity_fused
             )
             if is_sequential:
@@ -482,7 +504,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x[:, DOWN] = logged_values[e, :, 1]
         if field_samples is None:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
-            R[:, :2] = _noise_to_reach(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
+            R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
             heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.vision_height or heights is not None:
                 R[:, 1] = IGNORED_VARIANCE
@@ -491,21 +513,26 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     R[:, 1] = np.where(is_active[e], noise[e, :, 5], IGNORED_VARIANCE)
             x, P = _joint_update(x, P, innovation, R)
             x[:, HEADING] = heading
-        if has_sample[e] and reset[e].any():
+        if has_sample[e] and is_reset[e].any():
             reset_variance = inputs.rules.reset_variance_factor * noise[e, :, POSITION_COLUMNS]
             set_states(
-                x, P, reset[e], HORIZONTAL, measured_values[e, :, POSITION_COLUMNS], reset_variance
+                x,
+                P,
+                is_reset[e],
+                HORIZONTAL,
+                measured_values[e, :, POSITION_COLUMNS],
+                reset_variance,
             )
-            if has_speed and inputs.rules.resets_velocity:
+            if has_velocity and inputs.rules.resets_velocity:
                 set_states(
                     x,
                     P,
-                    reset[e],
+                    is_reset[e],
                     VELOCITY,
                     measured_values[e, :, VELOCITY_COLUMNS],
                     noise[e, :, VELOCITY_COLUMNS],
                 )
-            position_reset_m[e, reset[e]] = nu[reset[e], POSITION_COLUMNS]
+            position_reset_m[e, is_reset[e]] = nu[is_reset[e], POSITION_COLUMNS]
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
@@ -513,7 +540,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             if inputs.rules.resets_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
         if heights is not None and bad_acceleration.models_flag:
-            if has_sample[e] and has_speed:
+            if has_sample[e] and has_velocity:
                 heights.update_log[e, -1, 0] = np.where(
                     can_fuse_velocity[e], nu[:, DOWN_COLUMN], np.nan
                 )
@@ -537,12 +564,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         noise,
         is_rejected,
         is_fused,
-        reset,
+        is_reset,
         position_reset_m if vision is None else position_reset_m + vision.position_reset_m,
         states,
         state_variances,
         P,
-        field_record,
+        field_results,
         heights,
         vision,
     )
@@ -559,12 +586,12 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def _reduce_variance_to(P: Array, row: int, target_variance: Array) -> ArrayPair:
+def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
     """Return gain and covariance after an update that reduces a state's variance to a target."""
-    variance = P[:, row, row]
-    R = _noise_to_reach(variance, target_variance)
-    K = P[:, :, row] / (variance + R)[:, None]
-    return K, P - K[:, :, None] * P[:, None, row]
+    state_variance = P[:, state_index, state_index]
+    R = _noise_for_variance(state_variance, target_variance)
+    K = P[:, :, state_index] / (state_variance + R)[:, None]
+    return K, P - K[:, :, None] * P[:, None, state_index]
 
 
 def _sequential_update(
@@ -577,9 +604,9 @@ def _sequential_update(
     - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
-    weight = is_fused / S
-    weight_squared = weight * weight
-    b = 2.0 * weight - weight_squared * R
+    fused_weight = is_fused / S
+    weight_squared = fused_weight * fused_weight
+    b = 2.0 * fused_weight - weight_squared * R
     rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
@@ -589,7 +616,7 @@ def _sequential_update(
         if j + 1 < nu.shape[1]:
             factor = b[:, j, None] * cross_covariance[:, j + 1 :]
             columns[:, j + 1 :] -= factor[:, :, None] * column
-    x = x + ((weight * nu)[:, None] @ columns)[:, 0]
+    x = x + ((fused_weight * nu)[:, None] @ columns)[:, 0]
     root = np.sqrt(b)[:, :, None] * columns
     return x, P - np.swapaxes(root, 1, 2) @ root
 
@@ -600,7 +627,7 @@ class _Fusion:
 
     After a time without fusion the position is reset; after several resets in a row fusion stops
     until a sample with ``can_start``. Source: updateEvPosFusion and startEvPosFusion
-    (``ev_pos_control.cpp``). ``rejected`` and ``reset`` are EKF2's logged decisions.
+    (``ev_pos_control.cpp``). ``logged_rejected`` and ``logged_reset`` are EKF2's logged decisions.
     """
 
     rules: FusionRules
@@ -610,8 +637,8 @@ class _Fusion:
     time_s: Array
     has_gate: BoolArray
     uses_logged_decisions: BoolArray
-    rejected: Array
-    reset: BoolArray
+    logged_rejected: Array
+    logged_reset: BoolArray
     has_all_resets: bool
 
     def __post_init__(self) -> None:
@@ -622,7 +649,7 @@ class _Fusion:
         self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
         # True for events without any reset, start or rejection in the log
         self.only_gate_decides = (
-            (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
+            (self.action == FUSE).all(axis=1) & ~self.logged_reset & ~(self.logged_rejected > 0.0)
         )
 
     def decide(
@@ -639,13 +666,15 @@ class _Fusion:
         has_gate = self.has_gate
         follows_log = self.uses_logged_decisions
         may_fuse = action == FUSE
-        is_decision_logged = math.isfinite(self.rejected[e])
+        is_decision_logged = math.isfinite(self.logged_rejected[e])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[e] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
             return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
         is_rejected = (
-            np.where(follows_log & is_decision_logged, self.rejected[e] > 0.0, is_outside_gate)
+            np.where(
+                follows_log & is_decision_logged, self.logged_rejected[e] > 0.0, is_outside_gate
+            )
             & has_gate
             & may_fuse
         )
@@ -654,7 +683,7 @@ class _Fusion:
             # without a reset in the log EKF2 fused the last sample before the time limit
             following = min(e + 1, len(self.time_s) - 1)
             is_last = self.time_s[following] - self.last_position_s > rules.reset_s
-            is_rejected &= ~(follows_log & is_last & ~self.reset[following])
+            is_rejected &= ~(follows_log & is_last & ~self.logged_reset[following])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
         is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
         is_failing = is_rejected & ~self.is_stopped & (gap_s > rules.reset_s)
@@ -662,8 +691,8 @@ class _Fusion:
             are_both_late = now_s - self.last_velocity_s > rules.reset_s
             is_failing &= are_both_late | (gap_s > 2.0 * rules.reset_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
-        if is_decision_logged or self.reset[e] or self.has_all_resets:
-            logged_restart = has_gate & (self.reset[e] | (action == START))
+        if is_decision_logged or self.logged_reset[e] or self.has_all_resets:
+            logged_restart = has_gate & (self.logged_reset[e] | (action == START))
             is_restarted = np.where(follows_log, logged_restart, is_restarted)
             is_fused &= ~is_restarted
             is_failing &= ~follows_log
@@ -681,8 +710,8 @@ def _variance_growth(
     inputs: Inputs,
     segment: ReplaySegment,
     parameters: dict[str, Array],
-    biases: BoolArray,
-    attitude: BoolArray,
+    has_biases: BoolArray,
+    has_attitude: BoolArray,
 ) -> ArrayPair:
     """Return the process noise of biases and magnetic fields in one step, and its upper limits.
 
@@ -691,12 +720,14 @@ def _variance_growth(
     names = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.field is not None:
         names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
-    density, limit = (
+    noise_density, variance_limit = (
         np.stack([parameters[f"EKF2_{name}_NOISE"] for name in noises], axis=-1)
         for noises in (names, names.values())
     )
-    density[:, :2] *= np.stack([attitude, biases], axis=-1)
-    return np.repeat((density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(limit**2, 3, axis=-1)
+    noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
+    return np.repeat((noise_density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(
+        variance_limit**2, 3, axis=-1
+    )
 
 
 def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
@@ -705,33 +736,33 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
     Without correlations, the first updates would divide the error differently than EKF2 between
     tilt and accelerometer bias. The correlations are estimated from the flight before the segment.
     """
-    correlation = _settled_correlation(segment)
+    state_correlation = _settled_state_correlation(segment)
     if (history := segment.history) is not None:
         inputs = replace(inputs, vision=None)
         configuration = FilterConfiguration(inputs.settings)
-        history = replace(history, correlation=_settled_correlation(history))
+        history = replace(history, state_correlation=_settled_state_correlation(history))
         intervals = make_intervals(inputs, history, configuration.timing(inputs))
-        correlation = _correlation(
+        state_correlation = _correlation_of_covariance(
             run_segment(inputs, history, [configuration], [intervals]).covariance[0]
         )
     if segment.field is not None:
         # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
-        correlation = block_diag(
-            correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
+        state_correlation = block_diag(
+            state_correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
         )
-        correlation[HEADING] = 0.0
-        correlation[:, HEADING] = 0.0
-        correlation[HEADING, HEADING] = 1.0
-    return replace(segment, correlation=correlation)
+        state_correlation[HEADING] = 0.0
+        state_correlation[:, HEADING] = 0.0
+        state_correlation[HEADING, HEADING] = 1.0
+    return replace(segment, state_correlation=state_correlation)
 
 
-def _correlation(P: Array) -> Array:
+def _correlation_of_covariance(P: Array) -> Array:
     # the lower limit avoids a division by zero: a bias that is not estimated has variance 0
-    deviation = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
-    return np.asarray(P / deviation[:, None] / deviation)
+    sigma = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
+    return np.asarray(P / sigma[:, None] / sigma)
 
 
-def _settled_correlation(segment: ReplaySegment) -> Array:
+def _settled_state_correlation(segment: ReplaySegment) -> Array:
     """Return the correlations of tilt and accelerometer bias after long velocity fusion.
 
     Their effects on the acceleration cancel: θ × f = Rb.
@@ -743,7 +774,7 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
         P[tilt, bias] = P[bias, tilt] = (
             min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias]) / acceleration_per_rad
         )
-    return _correlation(to_earth.T @ P @ to_earth)
+    return _correlation_of_covariance(to_earth.T @ P @ to_earth)
 
 
 def _diagonal(P: Array) -> Array:
@@ -755,8 +786,8 @@ def _start_state(
     segment: ReplaySegment, has_biases: BoolArray, has_attitude: BoolArray
 ) -> ArrayPair:
     x = np.tile(segment.state, (len(has_biases), 1))
-    deviation = np.sqrt(segment.variance)
-    P = np.tile(deviation[:, None] * segment.correlation * deviation, (len(has_biases), 1, 1))
+    sigma = np.sqrt(segment.variance)
+    P = np.tile(sigma[:, None] * segment.state_correlation * sigma, (len(has_biases), 1, 1))
     for rows, is_estimated in (
         (THETA, has_attitude),
         (GYRO_BIAS, has_attitude),
@@ -769,29 +800,35 @@ def _start_state(
     return x, P
 
 
-def _noise_to_reach(variance: Array, target_variance: Array) -> Array:
+def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
     """Return the R with which an update reduces a state variance to a target.
 
     1/R = 1/target - 1/variance. EKF2's published height and heading are fused with this R to
     reproduce their logged variances.
     """
     excess_variance = variance - target_variance
-    noise = np.full(excess_variance.shape, IGNORED_VARIANCE)
-    np.divide(variance * target_variance, excess_variance, out=noise, where=excess_variance > 0.0)
-    return noise
+    noise_variance = np.full(excess_variance.shape, IGNORED_VARIANCE)
+    np.divide(
+        variance * target_variance, excess_variance, out=noise_variance, where=excess_variance > 0.0
+    )
+    return noise_variance
 
 
-def _limit_bias(P: Array, floor: float, has_biases: BoolArray) -> None:
+def _limit_bias(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
-    variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
-    min_variance = np.maximum(MIN_BIAS_VARIANCE_RATIO * variance.max(axis=1, keepdims=True), floor)
-    variance[has_biases] = np.clip(variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[has_biases]
+    bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
+    min_variance = np.maximum(
+        MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), absolute_minimum
+    )
+    bias_variance[has_biases] = np.clip(bias_variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[
+        has_biases
+    ]
 
 
 def _measurements(
     inputs: Inputs,
     segment: ReplaySegment,
-    sample: IntArray,
+    sample_index: IntArray,
     event_steps: IntArray,
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
@@ -804,11 +841,11 @@ def _measurements(
     ]
     measured_values, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
     lever_arm_ned = (segment.body_to_ned[event_steps] @ offset_m)[..., 0]
-    measured_values[..., 3:] = received.position_m[sample][:, None] - lever_arm_ned
+    measured_values[..., 3:] = received.position_m[sample_index][:, None] - lever_arm_ned
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
     reported_variance = np.where(
-        uses_reported_noise[:, None], received.variance_m2[sample][:, None], 0.0
+        uses_reported_noise[:, None], received.variance_m2[sample_index][:, None], 0.0
     )
     noise[..., 3:] = np.maximum(
         reported_variance, np.maximum(parameters[aid.noise], MIN_SIGMA)[:, None] ** 2
@@ -820,8 +857,8 @@ def _measurements(
             / segment.step_s[event_steps - 1, None, None]
         )
         lever_arm_ned = (rotation_rate @ offset_m)[..., 0]
-        measured_values[..., :3] = received.velocity_m_s[sample][:, None] - lever_arm_ned
-        reported_variance = received.velocity_variance_m2_s2[sample][:, None]
+        measured_values[..., :3] = received.velocity_m_s[sample_index][:, None] - lever_arm_ned
+        reported_variance = received.velocity_variance_m2_s2[sample_index][:, None]
         min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_SIGMA)[:, None] ** 2
         noise[..., :3] = np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
     if aid == GNSS_POS:

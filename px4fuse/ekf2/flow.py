@@ -23,20 +23,20 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     """Add the logged optical flow (:attr:`FusionRecord.flow`) to a segment; ``gate`` is in √S."""
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
-    count = flow["samples"].to_numpy()
+    sample_count = flow["samples"].to_numpy()
     interval_s = flow["interval_s"].to_numpy()
-    step, weight = low_pass_weights(
-        segment, flow.index.to_numpy(), count, interval_s, FLOW_FILTER_WEIGHT
+    step_index, weight = low_pass_weights(
+        segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_WEIGHT
     )
-    rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)[:, :, :2]
+    rotation_to_body = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
     imu_velocity = np.einsum(
-        "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step]
+        "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step_index]
     )
     samples = SensorSamples(
-        step[:, 0],
+        step_index[:, 0],
         flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity,
         np.einsum("ki,kiab->kab", weight, rotation_to_body),
-        count,
+        sample_count,
         flow["noise_m2_s2"].to_numpy(),
         gate,
     )

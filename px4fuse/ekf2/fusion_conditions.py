@@ -23,19 +23,18 @@ EV_START_INTERVAL_S = 0.2
 # (ev_pos_control.cpp)
 EV_STOP_INTERVAL_S = 0.4
 # EKF2 stops GNSS fusion, and before v1.14 vision fusion, after this time (s): reset_timeout_max
-STOP_S = 7.0
-# Maximum value (s) of EKF2's delay parameters
+FUSION_STOP_S = 7.0
+# Maximum delay (s) of EKF2's fusion horizon, from the delay parameters
 MAX_HORIZON_S = 1.0
-# Number of position samples that EKF2 buffers
+# Number of position samples in EKF2's buffer
 BUFFER_COUNT = 20
-# Tolerance (s) in comparisons of intervals: half of the resolution of timestamps
+# Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
 TIME_STEP_S = 5e-7
-# Time (s) of rejections after which EKF2 stops fusion: no_aid_timeout_max
-GATE_TIME_S = 1.0
-# Positions with a smaller range (m) are constant, so they are no measurement
-MAX_CONSTANT_M = 1e-3
-# A GNSS check is the reason if it fails in this fraction of the time: EKF2 waits 10 s after a
-# failure
+# Time (s) with all samples rejected after which EKF2 stops fusion: no_aid_timeout_max
+MAX_REJECTED_S = 1.0
+# Maximum range (m) of constant positions, which are no measurement
+MAX_CONSTANT_RANGE_M = 1e-3
+# Minimum fraction of the time with a failed GNSS check that explains missing GNSS fusion
 MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
@@ -126,11 +125,11 @@ class Attempt:
 
     def fraction(self, state: str, bit: int = 0) -> float:
         """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
-        steps = self.ekf2.states.get(state)
-        if steps is None:
+        state_steps = self.ekf2.states.get(state)
+        if state_steps is None:
             return float("nan")
-        values = step_values_at(steps, np.linspace(*self.span_s, 200))
-        return float(np.mean(values.astype(np.int64) >> bit & 1))
+        state_values = step_values_at(state_steps, np.linspace(*self.span_s, 200))
+        return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 
 def find_unmet(attempt: Attempt) -> UnmetCondition:
@@ -140,26 +139,28 @@ def find_unmet(attempt: Attempt) -> UnmetCondition:
 
 
 def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
-    name, bit = attempt.aid.switch, 0
+    parameter_name, bit = attempt.aid.switch, 0
     if not attempt.has_switch:
-        name, bit = AID_MASK, 3 if attempt.is_vision else 0
-    value = int(attempt.parameters.get(name, 1 << bit))
-    if value >> bit & 1:
+        parameter_name, bit = AID_MASK, 3 if attempt.is_vision else 0
+    parameter_value = int(attempt.parameters.get(parameter_name, 1 << bit))
+    if parameter_value >> bit & 1:
         return
-    quantity = "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
+    fused_quantity = (
+        "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
+    )
     reason, action = (
-        f"Bit {bit} ({quantity}) of {name} is not set.",
-        f"Set {name} to {value | 1 << bit}.",
+        f"Bit {bit} ({fused_quantity}) of {parameter_name} is not set.",
+        f"Set {parameter_name} to {parameter_value | 1 << bit}.",
     )
     if is_height_only(attempt.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
-        action = f"Leave bit {bit} of {name} unset."
-    yield UnmetCondition("switch", f"{name} is {value}", reason, action)
+        action = f"Leave bit {bit} of {parameter_name} unset."
+    yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
 def is_height_only(source: PositionTrack) -> bool:
     """Return True if x and y of a source are constant: only its height is measured."""
-    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M)
+    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
 
 
 def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
@@ -176,7 +177,7 @@ def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
 
 def _check_gap(attempt: Attempt) -> Iterator[UnmetCondition]:
     is_short = attempt.is_vision and attempt.has_switch
-    limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
+    limit_s = EV_STOP_INTERVAL_S if is_short else FUSION_STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
     # EKF2 stops fusion when no position has arrived for limit_s
@@ -237,22 +238,22 @@ def _check_quality(attempt: Attempt) -> Iterator[UnmetCondition]:
     quality = attempt.samples_in_span(status)["quality"]
     # EKF2 needs a good quality of the sample, of the sample before, and of the newest sample in the
     # buffer
-    count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
+    sample_count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
     is_good = (quality >= minimum).astype(float)
-    if is_good.rolling(min(count, max(len(quality), 1))).min().max() == 1.0:
+    if is_good.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
         return
-    median = float(quality.median())
+    median_quality = float(quality.median())
     reason = (
         f"{100.0 * (1.0 - is_good.mean()):.0f} % of {len(quality)} positions are below the limit."
     )
     action = (
         "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
-        f"{max(median, 0.0):.0f} only if the positions are correct."
+        f"{max(median_quality, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
         reason += " The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
         action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
-    fault = f"the quality is {median:.0f}, below EKF2_EV_QMIN {minimum:.0f}"
+    fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {minimum:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
 
 
@@ -304,30 +305,34 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
         )
     parameters, source = attempt.parameters, attempt.source
     # bits of EKF2_GPS_CHECK are lower by one; the fix is always checked
-    mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
+    checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
     fractions = {bit: attempt.fraction("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
-    failed = [bit for bit in fractions if mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION]
-    if not failed:
+    failed_bits = [
+        bit for bit in fractions if checked_mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION
+    ]
+    if not failed_bits:
         return
-    failed.sort(key=lambda bit: -fractions[bit])
+    failed_bits.sort(key=lambda bit: -fractions[bit])
     samples = attempt.samples_in_span(source.samples)
-    squares = {3: samples["north_m2"], 4: samples["down_m2"]}
+    median_squares = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
-        squares[5] = attempt.samples_in_span(source.velocity)["north_m2_s2"]
-    texts = []
-    for bit in failed[:3]:
+        median_squares[5] = attempt.samples_in_span(source.velocity)["north_m2_s2"]
+    check_texts = []
+    for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
         text = f"{name} ({100.0 * fractions[bit]:.0f} % of the time"
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            value = float(np.sqrt(squares[bit].median())) if bit in squares else np.nan
+            median_value = (
+                float(np.sqrt(median_squares[bit].median())) if bit in median_squares else np.nan
+            )
             # the samples contain only positions with a fix, so their median may be below the limit
-            text += f", median {value:.2f}{unit}" if value > limit else ""
+            text += f", median {median_value:.2f}{unit}" if median_value > limit else ""
             text += f", limit {parameter} {limit:g}{unit}"
-        texts.append(f"{text})")
+        check_texts.append(f"{text})")
     yield UnmetCondition(
         "checks",
-        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0]][0]}",
-        f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
+        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",
+        f"Failed checks: {'; '.join(check_texts)}. EKF2 starts to fuse GNSS after "
         f"{parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
         "Give the antenna a free view of the sky, and take off only after EKF2 fuses GNSS.",
     )
@@ -335,14 +340,14 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
 
 def _check_gate(attempt: Attempt) -> Iterator[UnmetCondition]:
     aid = attempt.aid
-    log = attempt.ekf2.aids.get(aid.name)
-    if log is None or "rejected" not in log.samples:
+    aid_log = attempt.ekf2.aids.get(aid.name)
+    if aid_log is None or "rejected" not in aid_log.samples:
         return
-    fraction = attempt.samples_in_span(log.samples, GATE_TIME_S)["rejected"].mean()
-    if fraction > 0.5:
+    rejected_fraction = attempt.samples_in_span(aid_log.samples, MAX_REJECTED_S)["rejected"].mean()
+    if rejected_fraction > 0.5:
         yield UnmetCondition(
             "gate",
-            f"EKF2 rejects {100.0 * fraction:.0f} % of the positions",
+            f"EKF2 rejects {100.0 * rejected_fraction:.0f} % of the positions",
             "The innovations are beyond EKF2's gate of "
             f"{attempt.parameters.get(aid.gate, aid.default_gate):g} √S.",
             f"Check the frame of the positions, {aid.delay} and {aid.noise}. Increase {aid.gate} "

@@ -45,22 +45,22 @@ MAX_BIAS_LOG_DELAY_S = 1.0
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) that EKF2 uses
 MIN_GATE = 1.0
-# Minimum measurement noise (σ) that EKF2 uses, for positions (m) and velocities (m/s)
+# Minimum σ of the measurement noise that EKF2 uses: position (m) or velocity (m/s)
 MIN_SIGMA = 0.01
 # Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 
 
 def add_heights(
-    flight: Flight, ekf2: Ekf2, record: FusionRecord, segments: Sequence[ReplaySegment]
+    flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
     """Add height measurements to the segments, or return the reason why the log is insufficient."""
-    parameters = record.parameters
-    times = np.concatenate([segment.time_s for segment in segments])
+    parameters = fusion_record.parameters
+    replayed_s = np.concatenate([segment.time_s for segment in segments])
     if fuses_by_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled_fractions = {
-        name: np.mean(step_values_at(log.enabled, times) > 0.0)
+        name: np.mean(step_values_at(log.enabled, replayed_s) > 0.0)
         for name, log in ekf2.aids.items()
         if log.enabled is not None
     }
@@ -76,40 +76,42 @@ def add_heights(
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
     measured_at_s, down_m, weight = np.zeros((3, 0))
     if BAROMETER.name in fused_aids and flight.barometer is not None:
-        logged = flight.barometer["down_m"]
-        logged = logged.set_axis(logged.index - 0.5 * ekf2.step_s)
-        samples = fused_samples(ekf2, record, logged)
-        measured_at_s = samples.index.to_numpy()
-        down_m = samples["down_m"].to_numpy() + record.altitude_m
-        weight = samples["weight"].to_numpy()
+        barometer_down_m = flight.barometer["down_m"]
+        barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
+        fused_barometer = fused_samples(ekf2, fusion_record, barometer_down_m)
+        measured_at_s = fused_barometer.index.to_numpy()
+        down_m = fused_barometer["down_m"].to_numpy() + fusion_record.altitude_m
+        weight = fused_barometer["weight"].to_numpy()
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
-    dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
+    dead_zone_m = np.where(
+        fusion_record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0
+    )
     new_segments = []
-    delayed_down_m = record.delayed["down_m"]
+    delayed_down_m = fusion_record.delayed["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
-        bias = (0.0, 0.0)
+        barometer_bias = (0.0, 0.0)
         for aid_name in {*fused_aids} - {reference}:
-            logged_bias = record.height_bias.get(aid_name)
+            logged_bias = fusion_record.height_bias.get(aid_name)
             if (
                 logged_bias is None
                 or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
             ):
                 return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
-            value, variance = (
+            bias_m, bias_m2 = (
                 float(np.interp(start_s, logged_bias.index, logged_bias[name]))
                 for name in ("bias_m", "bias_m2")
             )
-            bias = value, variance
+            barometer_bias = bias_m, bias_m2
         columns = measured_at_s, down_m, dead_zone_m, weight
         samples_inside = barometer_samples_inside(segment, *columns)
         rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
-        state = segment.state.copy()
-        state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
-        heights = HeightSamples(tuple(fused_aids), reference, bias, *samples_inside)
-        new_segments.append(replace(segment, state=state, heights=heights))
+        initial_state = segment.state.copy()
+        initial_state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
+        heights = HeightSamples(tuple(fused_aids), reference, barometer_bias, *samples_inside)
+        new_segments.append(replace(segment, state=initial_state, heights=heights))
     return tuple(new_segments)
 
 
@@ -134,8 +136,8 @@ def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[
     """
     heights = segment.heights
     assert heights is not None
-    more = heights.measured_at_s, heights.dead_zone_m, heights.weight
-    columns = heights.down_m[:, None], slice(2, 3), *more
+    age_dead_zone_weight = heights.measured_at_s, heights.dead_zone_m, heights.weight
+    columns = heights.down_m[:, None], slice(2, 3), *age_dead_zone_weight
     return pad_samples(
         [samples_by_event(segment, event_steps, heights.step, *columns) for event_steps in ends]
     )
@@ -214,18 +216,20 @@ class HeightFilter:
 
         ``end_s`` is the time of each event.
         """
-        rows = []
-        slots = len(self.down_m)
-        for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
+        update_rows = []
+        barometer_slot_count = len(self.down_m)
+        for slot in (
+            [barometer_slot_count] if sensor == GNSS_HGT.name else range(barometer_slot_count)
+        ):
             times = self.time_s[slot]
             has_sample = self.has_sample[slot][:, configuration_index]
             measured_s = times[has_sample, min(configuration_index, times.shape[1] - 1)]
             updates = self.update_log[has_sample, slot, :, configuration_index].T
-            rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
-        measured_s, nu, S, is_fused, end_s = np.hstack(rows)
-        columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
-        columns |= {"rejected": 1.0 - is_fused, "fused": is_fused, "fused_at_s": end_s}
-        return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
+            update_rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
+        measured_s, nu, S, is_fused, end_s = np.hstack(update_rows)
+        update_columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
+        update_columns |= {"rejected": 1.0 - is_fused, "fused": is_fused, "fused_at_s": end_s}
+        return pd.DataFrame(update_columns, pd.Index(measured_s, name="time_s")).sort_index()
 
     def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
@@ -270,7 +274,7 @@ class HeightFilter:
         R: Array,
     ) -> ArrayPair:
         """Fuse one height innovation ``nu``; ``column`` is PH', ``predicted_variance`` HPH'."""
-        weight = self.weight[slot][e]
+        sample_weight = self.weight[slot][e]
         if self.biased[sensor_index]:
             nu, R = self.bias.remove_bias(
                 nu,
@@ -278,7 +282,7 @@ class HeightFilter:
                 R,
                 self.interval_s[slot, e],
                 self.updates_bias[slot, e],
-                weight,
+                sample_weight,
             )
         if sensor_index == 0 and self.in_ground_effect[slot, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
@@ -289,10 +293,10 @@ class HeightFilter:
             is_clipped = (
                 has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot][e])
             )
-            limit = np.sqrt(self.gate_squared[sensor_index] * S)
-            nu = np.where(is_clipped, np.clip(nu, -limit, limit), nu)
+            innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
+            nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
         update_log = self.update_log[e, slot]
         update_log[0], update_log[1], update_log[2] = nu, S, is_fused
-        K = column * (is_fused / (predicted_variance + R / weight))[:, None]
+        K = column * (is_fused / (predicted_variance + R / sample_weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

@@ -69,7 +69,7 @@ ROTATE_VISION_BIT = 64
 # Maximum time difference (s) between a logged innovation and its sample: estimator_aid_src topics
 # contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
-# Tolerance (s) for rounding in comparisons of sample times with times of prediction steps
+# Tolerance (s) for rounding errors between sample times and prediction times
 STEP_TOLERANCE_S = 1e-4
 # Time (s) without fusion of horizontal aiding after which EKF2 reports inertial dead reckoning
 # (no_aid_timeout_max, common.h)
@@ -79,15 +79,15 @@ GNSS_VELOCITY_BIT = 4
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
-# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms
+# Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Maximum fraction of IMU samples missing from the log, outside gaps
+# Maximum fraction of missing IMU samples outside gaps for an EKF2 replay
 MAX_LOST_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Number of position resets in a row for releases without a limit
+# Number of successive position resets in PX4 releases without a limit
 UNLIMITED_RESETS = 1_000_000
-# Maximum interval (s) between height and heading measurements in a gap of the position source
+# Maximum interval (s) between height and heading updates in a gap of the position source
 MAX_INTERVAL_S = 0.25
 
 
@@ -208,11 +208,11 @@ class Inputs:
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
-    flight: Flight, doubtful_aids: Mapping[str, str] = MappingProxyType({})
+    flight: Flight, omitted_aids: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
-    ``doubtful_aids`` are aiding sources, by PX4's name, that the model cannot reproduce, with the
+    ``omitted_aids`` are aiding sources, by PX4's name, that the model cannot reproduce, with the
     reason. The replay omits them.
     """
     imu = flight.imu
@@ -229,17 +229,21 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     logged_ekf2 = ekf2
     if is_gnss:
         ekf2 = with_gnss_innovations(ekf2)
-    record = ekf2.record
+    fusion_record = ekf2.record
     horizon_s = ekf2.horizon_s
-    if isinstance(record, Unavailable):
-        return record
+    if isinstance(fusion_record, Unavailable):
+        return fusion_record
     # the simulated earth is a sphere without rotation
     if MODEL_NOTE in flight.log.notes:
-        record = replace(record, latitude_deg=np.nan)
+        fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if is_gnss else ()
-    if unmodelled_aids := [label for label in record.other_aiding if label not in modelled_aids]:
+    modelled_aids = (
+        (*GNSS_LABELS, *([FLOW.label] if len(fusion_record.flow) else [])) if is_gnss else ()
+    )
+    if unmodelled_aids := [
+        label for label in fusion_record.other_aiding if label not in modelled_aids
+    ]:
         disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
         return Unavailable(
             ANALYSIS_NAME,
@@ -249,7 +253,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if missing_imu := _missing_imu(imu.index.to_numpy()):
         return missing_imu
     position_samples = (
-        read_gnss(flight, ekf2, record) if is_gnss else read_vision(flight, ekf2, record, attitude)
+        read_gnss(flight, ekf2, fusion_record)
+        if is_gnss
+        else read_vision(flight, ekf2, fusion_record, attitude)
     )
     if isinstance(position_samples, Unavailable):
         return position_samples
@@ -260,25 +266,29 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             "Record estimator_status_flags and the position source for the whole flight.",
         )
     vision = (
-        _read_vision_besides_gnss(flight, logged_ekf2, record, attitude)
-        if is_gnss and EV_POS.name not in doubtful_aids
+        _read_vision_besides_gnss(flight, logged_ekf2, fusion_record, attitude)
+        if is_gnss and EV_POS.name not in omitted_aids
         else None
     )
     if isinstance(vision, Unavailable):
         return vision
     # from PX4 v1.17 on each GNSS receiver has a separate lever arm, logged in the GNSS messages
-    track = _gnss_track(flight) if is_gnss else None
-    lever_arm = {} if track is None else dict(zip(aid.lever_arm, track.lever_arm_m, strict=True))
+    gnss_track = _gnss_track(flight) if is_gnss else None
+    lever_arm = (
+        {} if gnss_track is None else dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
+    )
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
         # the fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
     aiding_s = position_samples.stamp_s
-    flow = record.flow if is_gnss else record.flow.iloc[:0]
-    if len(flow) and FLOW.name not in doubtful_aids:
-        aiding_s = np.union1d(aiding_s, flow.index)
-    segments = find_replay_segments(flight, imu, attitude, ekf2, record, aiding_s, is_gnss=is_gnss)
+    flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
+    if len(flow_samples) and FLOW.name not in omitted_aids:
+        aiding_s = np.union1d(aiding_s, flow_samples.index)
+    segments = find_replay_segments(
+        flight, imu, attitude, ekf2, fusion_record, aiding_s, is_gnss=is_gnss
+    )
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
@@ -287,16 +297,16 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             "Record without dropouts (faster SD card, fewer topics) and with a steady position "
             "source.",
         )
-    if len(flow):
-        gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
-        segments = tuple(add_flow_samples(segment, flow, gate) for segment in segments)
+    if len(flow_samples):
+        flow_gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
+        segments = tuple(add_flow_samples(segment, flow_samples, flow_gate) for segment in segments)
     logged_height_reason = "; ".join(
         f"{AIDS[name].label}: {reason}"
-        for name, reason in doubtful_aids.items()
+        for name, reason in omitted_aids.items()
         if name not in (FLOW.name, EV_POS.name)
     )
     if is_gnss and not logged_height_reason:
-        new_segments = add_heights(flight, ekf2, record, segments)
+        new_segments = add_heights(flight, ekf2, fusion_record, segments)
         segments, logged_height_reason = (
             (segments, new_segments) if isinstance(new_segments, str) else (new_segments, "")
         )
@@ -305,19 +315,21 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     heights = segments[0].heights
     other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
-        settings=effective_settings(record.parameters, aid, *other_aids) | lever_arm,
+        settings=effective_settings(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
         received=position_samples,
-        rules=_fusion_rules(record, ekf2.step_s, is_gnss=is_gnss),
+        rules=_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
-        predict_s=predict_s(record),
+        predict_s=predict_s(fusion_record),
         # EKF2 clips vision heights while it reports a bad acceleration; the model does not
         vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
         and not any(np.any(segment.is_acceleration_bad) for segment in segments),
-        imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
+        imu_offset_m=np.array(
+            [fusion_record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]
+        ),
         aid=aid,
         logged_height_reason=logged_height_reason,
         vision=vision,
@@ -326,18 +338,18 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 def lost_imu_fraction(time_s: Array) -> float:
     """Return the fraction of IMU samples that are missing from the log, outside gaps."""
-    intervals = np.diff(time_s)
-    lost_counts = np.rint(intervals[intervals <= IMU_GAP_S] / np.median(intervals)) - 1.0
+    intervals_s = np.diff(time_s)
+    lost_counts = np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
     return float(lost_count / (lost_count + len(time_s)))
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    interval = float(np.median(np.diff(time_s)))
-    if interval > MAX_IMU_INTERVAL_S:
+    median_interval_s = float(np.median(np.diff(time_s)))
+    if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
             ANALYSIS_NAME,
-            f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
+            f"the IMU is logged at {1.0 / median_interval_s:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
     if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
@@ -349,15 +361,15 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
     return None
 
 
-def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    min_bias_variance = 5e-8 / step_s**2 if record.per_step_biases else None
-    is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
+def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
+    min_bias_variance = 5e-8 / step_s**2 if fusion_record.per_step_biases else None
+    is_horizon_from_delay = "EKF2_DELAY_MAX" not in fusion_record.parameters
     if is_gnss:
         # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
         # gps_control.cpp)
-        reset_variance_factor = 2.0 if record.stores_latitude else 1.0
+        reset_variance_factor = 2.0 if fusion_record.stores_latitude else 1.0
         # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
-        resets_together = GNSS_MODE not in record.parameters
+        resets_together = GNSS_MODE not in fusion_record.parameters
         return FusionRules(
             np.inf,
             np.inf,
@@ -367,11 +379,11 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             is_horizon_from_delay,
             reset_variance_factor,
             resets_together,
-            bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
+            bad_acceleration_s=3.0 if fusion_record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
     # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
-    if not fuses_by_mask(record.parameters):
+    if not fuses_by_mask(fusion_record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
     return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
 
@@ -386,9 +398,11 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     """Return the times at which a source is enabled (1) or disabled (0); None if never enabled."""
-    log = ekf2.aids.get(aid.name)
+    aid_log = ekf2.aids.get(aid.name)
     return (
-        log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
+        aid_log.enabled
+        if aid_log is not None and aid_log.enabled is not None and aid_log.enabled.any()
+        else None
     )
 
 
@@ -396,7 +410,9 @@ def _gnss_track(flight: Flight) -> PositionTrack | None:
     return next((track for track in flight.positions if track.origin.is_gnss), None)
 
 
-def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPositions | Unavailable:
+def read_gnss(
+    flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord
+) -> ReceivedPositions | Unavailable:
     """Return the GNSS fixes that EKF2 received (NED), or the reason why they are incomplete."""
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
@@ -409,32 +425,34 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
             f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
             "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
-    parameters = record.parameters
-    switch = int(parameters.get(GNSS_POS.switch, 7.0))
-    samples = track.samples
-    velocities = track.velocity
+    parameters = fusion_record.parameters
+    control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
+    position_samples = track.samples
+    velocity_samples = track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_log := ekf2.aids[GNSS_POS.name].enabled) is not None:
-        is_enabled = step_values_at(enabled_log, samples.index) > 0.0
-        samples = samples[is_enabled]
-        velocities = velocities[is_enabled]
+        is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
+        position_samples = position_samples[is_enabled]
+        velocity_samples = velocity_samples[is_enabled]
     # the track has measurement times, from which the replay subtracts the delay again
     flown_settings = effective_settings(parameters, GNSS_POS)
     flown_s = flown_settings[GNSS_POS.delay] * 1e-3
-    timestamp_s = samples.index.to_numpy() + flown_s
+    timestamp_s = position_samples.index.to_numpy() + flown_s
     # upper limit (m) of the reported position noise in EKF2 (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
-    reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
-    velocity = velocities[Columns.VELOCITY].to_numpy()
-    fuses_velocity = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
-    velocity_variance = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
+    reported_variance = (
+        position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
+    )
+    velocity = velocity_samples[Columns.VELOCITY].to_numpy()
+    fuses_velocity = fuses_by_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
+    velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
-        samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
+        position_samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(fusion_record),
         reported_variance.to_numpy(),
-        *_logged_decisions(ekf2, record, timestamp_s, timestamp_s, GNSS_POS),
+        *_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
@@ -443,7 +461,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
 
 
 def read_vision(
-    flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
+    flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable:
     """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
@@ -452,15 +470,15 @@ def read_vision(
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
         return track
-    samples = track.samples.dropna(subset=Columns.POSITION[:2])
-    timestamp_s = samples.index.to_numpy()
-    position = samples[Columns.POSITION].to_numpy(copy=True)
-    variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
+    position_samples = track.samples.dropna(subset=Columns.POSITION[:2])
+    timestamp_s = position_samples.index.to_numpy()
+    position_m = position_samples[Columns.POSITION].to_numpy(copy=True)
+    variance_m2 = position_samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
     is_rotated_by_ekf2 = (
         not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
     )
-    if fuses_by_mask(record.parameters):
-        is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
+    if fuses_by_mask(fusion_record.parameters):
+        is_rotated_by_ekf2 = bool(int(fusion_record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
             return Unavailable(
@@ -478,57 +496,57 @@ def read_vision(
             for orientations in (attitude, track.orientation)
         )
         rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
-        position = rotate(rotation, position)
-        variance = rotate(rotation**2, variance)
-    age = record.vision_age_s
+        position_m = rotate(rotation, position_m)
+        variance_m2 = rotate(rotation**2, variance_m2)
+    vision_age_s = fusion_record.vision_age_s
     # without arrival times no sample is treated as late
     arrival_s = np.full(len(timestamp_s), -np.inf)
-    if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival_s = timestamp_s + np.interp(timestamp_s, age.index, age)
-    decisions = _logged_decisions(ekf2, record, timestamp_s, arrival_s)
+    if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
+        arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
+    rejected_and_reset = _logged_decisions(ekf2, fusion_record, timestamp_s, arrival_s)
     return ReceivedPositions(
         timestamp_s,
         arrival_s,
-        position,
-        variance,
-        *decisions,
+        position_m,
+        variance_m2,
+        *rejected_and_reset,
         track.name,
         reset_s=reset_times_s(track),
-        has_all_resets=DEAD_RECKONING in record.states,
+        has_all_resets=DEAD_RECKONING in fusion_record.states,
     )
 
 
 def _read_vision_besides_gnss(
-    flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
+    flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
     if (enabled_log := _enabled_log(ekf2, EV_POS)) is None:
         return None
-    if fuses_by_mask(record.parameters):
+    if fuses_by_mask(fusion_record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
             f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "
             "model does not contain",
             "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
         )
-    received = read_vision(flight, ekf2, record, attitude)
+    received = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received, Unavailable):
         return received
     is_disabled = step_values_at(enabled_log, received.stamp_s) == 0.0
-    position_m = received.position_m * ekf2_metres_per_metre(record)
+    position_m = received.position_m * ekf2_metres_per_metre(fusion_record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
 
 def _logged_decisions(
     ekf2: Ekf2,
-    record: FusionRecord,
+    fusion_record: FusionRecord,
     timestamp_s: Array,
     arrival_s: Array,
     aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
     """Return EKF2's logged rejection and reset at each position sample."""
     rejected_flags = np.full(len(timestamp_s), np.nan)
-    reset = np.zeros(len(timestamp_s), dtype=bool)
+    is_reset = np.zeros(len(timestamp_s), dtype=bool)
     innovations = ekf2.innovations["north"]
     horizon_s = ekf2.horizon_s
     if (
@@ -536,51 +554,58 @@ def _logged_decisions(
         or isinstance(horizon_s, Unavailable)
         or aid_source(aid) not in ekf2.innovation_topics
     ):
-        return rejected_flags, reset
-    delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
+        return rejected_flags, is_reset
+    delay_s = effective_settings(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
     due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
-    log = ekf2.aids[aid.name].samples
+    aid_rows = ekf2.aids[aid.name].samples
     # EKF2 rejected all samples from the last fusion or reset to each row, and in dead reckoning
-    fusions = log.reindex(columns=["last_fused_s"]).dropna()
+    fusions = aid_rows.reindex(columns=["last_fused_s"]).dropna()
     to_rows = np.column_stack([fusions, fusions.index])
-    in_reckoning = _dead_reckoning_spans(ekf2, record) if aid == EV_POS else to_rows[:0]
-    limits = np.searchsorted(due_s, np.concatenate([to_rows, in_reckoning]) + STEP_TOLERANCE_S)
-    for begin, end in limits.tolist():
+    dead_reckoning_s = _dead_reckoning_spans(ekf2, fusion_record) if aid == EV_POS else to_rows[:0]
+    span_rows = np.searchsorted(
+        due_s, np.concatenate([to_rows, dead_reckoning_s]) + STEP_TOLERANCE_S
+    )
+    for begin, end in span_rows.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_reset = np.isnan(rejected_flags)
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
-    logged = innovations.iloc[sample_row[sample_row >= 0]]
-    rejected_flags[sample_row >= 0] = logged["rejected"]
+    sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
+    rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
-    may_reset[sample_row >= 0] &= (logged["rejected"] > 0.0) | (logged["innovation_m"] == 0.0)
-    last_fused, ends = limits[: len(to_rows), 0] - 1, limits[len(to_rows) :, 1] - 1
+    may_reset[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
+        sample_innovations["innovation_m"] == 0.0
+    )
+    last_fused_rows, dead_reckoning_ends = (
+        span_rows[: len(to_rows), 0] - 1,
+        span_rows[len(to_rows) :, 1] - 1,
+    )
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
         rows = np.flatnonzero(is_recent & may_reset)
-        ends_here = np.intersect1d(rows, ends)
-        reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
-    is_fused = np.zeros(len(reset), bool)
-    is_fused[last_fused[last_fused >= 0]] = True
-    rejected_flags[is_fused & ~reset & np.isnan(rejected_flags)] = 0.0
-    return rejected_flags, reset
+        ends_here = np.intersect1d(rows, dead_reckoning_ends)
+        is_reset[ends_here[:1] if len(ends_here) else rows[-1:]] = True
+    is_fused = np.zeros(len(is_reset), bool)
+    is_fused[last_fused_rows[last_fused_rows >= 0]] = True
+    rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0
+    return rejected_flags, is_reset
 
 
-def _dead_reckoning_spans(ekf2: Ekf2, record: FusionRecord) -> Array:
+def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     """Return the times (s) without fusion of vision; each ends with a fusion or a reset.
 
     EKF2 reports inertial dead reckoning after DEAD_RECKONING_S without fusion, and immediately if
     vision is disabled.
     """
-    steps = record.states.get(DEAD_RECKONING)
-    enabled = ekf2.states.get(EV_POS.name)
-    if steps is None or enabled is None:
+    dead_reckoning_steps = fusion_record.states.get(DEAD_RECKONING)
+    vision_enabled_steps = ekf2.states.get(EV_POS.name)
+    if dead_reckoning_steps is None or vision_enabled_steps is None:
         return np.zeros((0, 2))
-    spans = np.array(flight_spans(steps == 0.0, np.inf)).reshape(-1, 2)
-    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(enabled, spans[:, 0]) > 0.0)
+    spans = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
+    spans[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans[:, 0]) > 0.0)
     return spans
 
 
@@ -609,21 +634,24 @@ def horizontal_resets_s(ekf2: Ekf2) -> Array:
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the track with all vision positions that EKF2 received."""
-    reasons = ["the log has no topic vehicle_visual_odometry"]
+    missing_reasons = ["the log has no topic vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_COPY_INTERVALS_S:
-            interval = float(np.median(np.diff(track.samples.index)))
-            if interval < 0.9 * VISION_COPY_INTERVALS_S[track.name] and interval <= 0.25:
+            median_interval_s = float(np.median(np.diff(track.samples.index)))
+            if (
+                median_interval_s < 0.9 * VISION_COPY_INTERVALS_S[track.name]
+                and median_interval_s <= 0.25
+            ):
                 return track
-            reasons.append(
-                f"{track.name} has a sample interval of {interval:.2g} s; EKF2 may have fused "
-                "more samples"
+            missing_reasons.append(
+                f"{track.name} has a sample interval of {median_interval_s:.2g} s; EKF2 may have "
+                "fused more samples"
             )
     return Unavailable(
         ANALYSIS_NAME,
-        "; ".join(reasons),
+        "; ".join(missing_reasons),
         "Set SDLOG_PROFILE to 129 (default and vision), or give the file of the positioning system "
         "with --position.",
     )

@@ -34,10 +34,10 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# EKF2 fuses a sample that arrives at most this time (s) after the fusion horizon has passed it
-# (RingBuffer.h, pop_first_older_than)
+# Maximum delay (s) of a fused sample after the fusion horizon (RingBuffer.h,
+# pop_first_older_than)
 MAX_LATENESS_S = 0.1
-# A sample that is fused later than this time (s) is reported as late: 3 cm at 1 m/s
+# Minimum delay (s) of a sample after the fusion horizon to count as late: 3 cm at 1 m/s
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
@@ -96,20 +96,22 @@ class Timing:
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
     """Compute the intervals of a segment; the number of events does not depend on ``timing``."""
     events = _events(inputs, segment, timing)
-    start = np.append(0, events.end_step[:-1])
-    end = events.end_step
-    count = len(end)
-    duration_s = segment.time_s[end] - segment.time_s[start]
-    transition = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
-    correction_input, acceleration_input = np.zeros((2, count, STATE_COUNT))
-    effects = _effects(segment, start, end)
+    start_steps = np.append(0, events.end_step[:-1])
+    end_steps = events.end_step
+    event_count = len(end_steps)
+    duration_s = segment.time_s[end_steps] - segment.time_s[start_steps]
+    transition = np.tile(np.eye(STATE_COUNT), (event_count, 1, 1))
+    correction_input, acceleration_input = np.zeros((2, event_count, STATE_COUNT))
+    effects = _effects(segment, start_steps, end_steps)
     transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
     transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]
     correction_input[:, :IMU_STATE_COUNT] = effects[..., CORRECTION_COLUMN]
     acceleration_input[:, :IMU_STATE_COUNT] = effects[..., INPUT_COLUMN]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-    noises = _noises((end - start).astype(float), duration_s, transition[:, VELOCITY, THETA])
-    return Intervals(events, transition, correction_input, acceleration_input, *noises)
+    noise_by_interval = _noises(
+        (end_steps - start_steps).astype(float), duration_s, transition[:, VELOCITY, THETA]
+    )
+    return Intervals(events, transition, correction_input, acceleration_input, *noise_by_interval)
 
 
 def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
@@ -122,31 +124,36 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     # a sample that arrives after the fusion horizon has passed its measurement time is fused late
     # or never
     due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
-    end = np.searchsorted(time_s, due_s - 1e-9)
-    is_inside = (end > 0) & (end <= last_step)
-    end = np.maximum.accumulate(np.minimum(end, last_step))
-    is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
+    end_steps = np.searchsorted(time_s, due_s - 1e-9)
+    is_inside = (end_steps > 0) & (end_steps <= last_step)
+    end_steps = np.maximum.accumulate(np.minimum(end_steps, last_step))
+    is_in_time = time_s[end_steps] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
-    is_usable[:-1] &= end[1:] > end[:-1]
-    action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
+    is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
+    action, can_start = _actions(inputs, segment, measured_s, end_steps, is_usable)
     action[np.isin(stamp_s, received.reset_s) & (action == FUSE)] = START
     # in gaps of the position source there are additional events; their number does not depend on
     # the delay
     gap_s = np.diff(np.r_[time_s[0], stamp_s, time_s[-1]])
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_places = np.cumsum(extra_events[:-1] + 1) - 1
-    total = len(stamp_s) + int(extra_events.sum())
-    events = np.zeros(total, EVENT)
+    event_count = len(stamp_s) + int(extra_events.sum())
+    events = np.zeros(event_count, EVENT)
     events["end_step"] = np.rint(
-        np.interp(np.arange(total), np.r_[-1, sample_places, total], np.r_[0, end, last_step])
+        np.interp(
+            np.arange(event_count),
+            np.r_[-1, sample_places, event_count],
+            np.r_[0, end_steps, last_step],
+        )
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
-    samples = np.arange(first_row, last_row)
-    lost = is_inside & ~is_in_time
+    is_late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
+    sample_indices = np.arange(first_row, last_row)
+    is_lost = is_inside & ~is_in_time
     events[sample_places] = np.rec.fromarrays(
-        [end, samples, action, is_usable, can_start, late, lost, measured_s], dtype=EVENT
+        [end_steps, sample_indices, action, is_usable, can_start, is_late, is_lost, measured_s],
+        dtype=EVENT,
     )
     return events.view(np.recarray)
 
@@ -166,14 +173,16 @@ def _actions(
     action = np.full(len(measured_at_s), IDLE)
     can_start = np.zeros(len(measured_at_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
-    interval = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
-    can_start[usable_rows] = interval < rules.start_interval_s
+    intervals_s = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
+    can_start[usable_rows] = intervals_s < rules.start_interval_s
     # time (s) without a usable sample before each sample
     gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
     is_fusing = segment.fusing
-    for row, (interval_s, gap_s) in enumerate(zip(interval.tolist(), gaps_s.tolist(), strict=True)):
+    for row, (interval_s, gap_s) in enumerate(
+        zip(intervals_s.tolist(), gaps_s.tolist(), strict=True)
+    ):
         is_fusing = is_fusing and not gap_s > rules.stop_s
         if is_fusing:
             action[usable_rows[row]] = FUSE
@@ -188,17 +197,17 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
 
     Shape (E, 9, EFFECT_COLUMN_COUNT), with one column per cause.
     """
-    length = end - start
+    step_counts = end - start
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
-    longest_first = np.argsort(-length, kind="stable")
+    longest_first = np.argsort(-step_counts, kind="stable")
     first_start = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMN_COUNT))
     attitude[:, :, 0:3] = np.eye(3)
     force_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
-    steps = np.arange(int(length.max(initial=0)))
+    step_numbers = np.arange(int(step_counts.max(initial=0)))
     for step_number, count in zip(
-        steps, np.searchsorted(-length[longest_first], -steps), strict=True
+        step_numbers, np.searchsorted(-step_counts[longest_first], -step_numbers), strict=True
     ):
         step = first_start[:count] + step_number
         rows = slice(count)

@@ -19,9 +19,9 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_SIGMA_GAUSS = 0.01
-EYE = np.eye(3)
-# Matrix with which v @ CROSS is the cross product matrix [v]× of a vector v
-CROSS = skew(EYE).reshape(3, 9)
+IDENTITY = np.eye(3)
+# Matrix with which v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v
+CROSS_PRODUCT = skew(IDENTITY).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -51,23 +51,23 @@ def mean_by_event(
 
     ``imu_velocity_m_s`` (NED) propagates velocity samples to the event.
     """
-    event = np.searchsorted(event_steps, sensor_samples.step)
-    is_inside = event < len(event_steps)
+    event_index = np.searchsorted(event_steps, sensor_samples.step)
+    is_inside = event_index < len(event_steps)
     event_count = len(event_steps)
-    event = event[is_inside]
-    count = np.maximum(np.bincount(event, minlength=event_count), 1)
+    event_index = event_index[is_inside]
+    sample_counts = np.maximum(np.bincount(event_index, minlength=event_count), 1)
 
     def mean(rows: Array) -> Array:
-        total = np.zeros((event_count, *rows.shape[1:]))
-        np.add.at(total, event, rows[is_inside])
-        return np.asarray((total.T / count).T)
+        event_sums = np.zeros((event_count, *rows.shape[1:]))
+        np.add.at(event_sums, event_index, rows[is_inside])
+        return np.asarray((event_sums.T / sample_counts).T)
 
     value, rotation_to_body, noise = map(
         mean, (sensor_samples.value, sensor_samples.rotation_to_body, sensor_samples.noise)
     )
     if imu_velocity_m_s is not None:
         value = value + np.einsum("eab,eb->ea", rotation_to_body, imu_velocity_m_s[event_steps])
-    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], event_count)
+    sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
     return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
 
 
@@ -104,19 +104,19 @@ def fuse_mean(
     bias_rows : slice, optional
         State (body frame) that is added to the measurement.
     """
-    state = x[:, rows]
+    measured_state = x[:, rows]
     sample_count = sample_mean.sample_count
     cross_state, cross_theta = (
-        (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (state, x[:, THETA])
+        (vectors @ CROSS_PRODUCT).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, rows] = sample_mean.rotation_to_body @ (EYE - cross_theta)
-    predicted = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
+    H[:, :, rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
+    predicted_value = (H[:, :, rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_rows is not None:
-        H[:, :, bias_rows] = EYE
-        predicted += x[:, bias_rows]
-    nu = sample_mean.value - predicted
+        H[:, :, bias_rows] = IDENTITY
+        predicted_value += x[:, bias_rows]
+    nu = sample_mean.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
     # diagonal is a view of S: adding R changes S in place

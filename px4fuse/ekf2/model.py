@@ -33,7 +33,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_samp
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    MANY_REJECTIONS_FRACTION,
+    MAX_COMPARED_REJECTIONS,
     UPDATE_COLUMNS,
     VELOCITY_UPDATE_COLUMNS,
     Agreement,
@@ -110,11 +110,9 @@ def open_model(
     while not isinstance(
         model := _open_without_aids(flight, request_configurations, failed_agreements), Unavailable
     ):
-        if not (
-            further_doubtful_aids := model.agreement.doubtful.keys() - failed_agreements.keys()
-        ):
+        if not (further_omitted_aids := model.agreement.doubtful.keys() - failed_agreements.keys()):
             break
-        failed_agreements |= dict.fromkeys(further_doubtful_aids, model.agreement)
+        failed_agreements |= dict.fromkeys(further_omitted_aids, model.agreement)
     return model
 
 
@@ -128,10 +126,8 @@ def _open_without_aids(
     ``failed_agreements`` contains, by PX4's name of the source, the bad agreement of a replay with
     it.
     """
-    doubtful_aids = {
-        name: agreement.doubtful[name] for name, agreement in failed_agreements.items()
-    }
-    inputs = prepare_inputs(flight, doubtful_aids)
+    omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
+    inputs = prepare_inputs(flight, omitted_aids)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
@@ -146,13 +142,13 @@ def _open_without_aids(
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
     runs = run_configurations(inputs, configurations, intervals_by_timing)
-    replay = _make_replay(inputs, runs, flown_configuration, {})
-    agreement = agreement_with_log(flight, replay)
+    flown_replay = _make_replay(inputs, runs, flown_configuration, {})
+    agreement = agreement_with_log(flight, flown_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
+    model = Model(flight, inputs, intervals_by_timing, flown_replay, agreement, tuple(runs))
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MANY_REJECTIONS_FRACTION and np.isfinite(inputs.received.rejected).any():
+    if rejected_share > MAX_COMPARED_REJECTIONS and np.isfinite(inputs.received.rejected).any():
         with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(with_decisions, Agreement):
             agreement = with_logged_rejections(agreement, with_decisions)
@@ -162,9 +158,11 @@ def _open_without_aids(
         for name, failed_agreement in failed_agreements.items()
     }
     agreement = structs.replace(
-        agreement, doubtful={**doubtful_aids, **agreement.doubtful}, **failed_fields
+        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_fields
     )
-    return replace(model, flown=structs.replace(replay, agreement=agreement), agreement=agreement)
+    return replace(
+        model, flown=structs.replace(flown_replay, agreement=agreement), agreement=agreement
+    )
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
@@ -198,18 +196,18 @@ def replay_settings(
     """
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
-    unmodelled = PARAMETERS.keys() - inputs.settings.keys()
-    reasons = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
+    unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
+    reasons = dict.fromkeys(unmodelled_parameters, f"EKF2 fused {inputs.aid.label} in this log")
     height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
-        for names, reason in (
+        for parameter_names, reason in (
             ((*MAG.own_parameters, *FIELD_NOISES), "the log lacks some fused magnetometer samples"),
             (
                 BAROMETER.own_parameters,
                 height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
             ),
         ):
-            reasons |= dict.fromkeys(unmodelled & {*names}, reason)
+            reasons |= dict.fromkeys(unmodelled_parameters & {*parameter_names}, reason)
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         reasons["EKF2_DELAY_MAX"] = (
@@ -231,9 +229,9 @@ def replay_settings(
         return ()
     uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
-        rows = same_sample(inputs.received.stamp_s, excluded_s)
+        excluded_rows = same_sample(inputs.received.stamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
-        rejected_flags[rows[rows >= 0]] = 1.0
+        rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
         no_reset = np.zeros(len(rejected_flags), dtype=bool)
         inputs = replace(
             inputs,
@@ -257,8 +255,10 @@ def replay_settings(
         updates = replay.updates
         if excluded_s is not None:
             age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
-            rows = same_sample(updates.index.to_numpy(), excluded_s - age_s)
-            updates = updates.iloc[np.delete(np.arange(len(updates)), rows[rows >= 0])]
+            excluded_rows = same_sample(updates.index.to_numpy(), excluded_s - age_s)
+            updates = updates.iloc[
+                np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
+            ]
         replays.append(structs.replace(replay, updates=updates, agreement=model.agreement))
     return tuple(replays)
 
@@ -284,8 +284,8 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
     new_inputs: dict[str, Any] = {}
     for name, samples in {"received": inputs.received, "vision": inputs.vision}.items():
         if samples is not None:
-            noise = rng.normal(scale=sigma_m, size=samples.position_m.shape)
-            new_inputs[name] = replace(samples, position_m=samples.position_m + noise)
+            position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
+            new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
     # the noise changes positions only, not their times, so the intervals remain valid
     return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
@@ -295,13 +295,13 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
     if not rotation_deg and not delay_s:
         return model
     received = model.inputs.received
-    rotation = Rotation.from_euler("z", rotation_deg, degrees=True).as_matrix().T
-    velocity = received.velocity_m_s
+    rotation_matrix = Rotation.from_euler("z", rotation_deg, degrees=True).as_matrix().T
+    velocity_m_s = received.velocity_m_s
     received = replace(
         received,
         stamp_s=received.stamp_s + delay_s,
-        position_m=received.position_m @ rotation,
-        velocity_m_s=None if velocity is None else velocity @ rotation,
+        position_m=received.position_m @ rotation_matrix,
+        velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
     intervals = {} if delay_s else model.intervals
     inputs = replace(model.inputs, received=received)
@@ -388,8 +388,8 @@ def _make_replay(
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
     """Return the spans (s) longer than RESTART_GAP_S without a fused position."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
-    ends = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
-    return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
+    fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
+    return [(a, b) for a, b in pairwise(fusion_times_s) if b - a > RESTART_GAP_S]
 
 
 def _other_aid_updates(
@@ -414,23 +414,33 @@ def _other_aid_updates(
 def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
     events = run.events[configuration_index]
     has_innovation = np.isfinite(run.innovation[:, configuration_index, POSITION_COLUMNS.start])
-    rows = np.flatnonzero(has_innovation)
-    flags = np.stack([run.rejected, run.fused, run.reset], axis=-1)[rows, configuration_index]
+    event_rows = np.flatnonzero(has_innovation)
+    decision_flags = np.stack([run.rejected, run.fused, run.reset], axis=-1)[
+        event_rows, configuration_index
+    ]
     nu, S, R = (
-        array[rows, configuration_index]
+        array[event_rows, configuration_index]
         for array in (run.innovation, run.innovation_variance, run.noise)
     )
-    variance_after = run.variance[rows + 1, configuration_index]
-    fused_at_s = run.segment.time_s[events.end_step[rows], None]
+    variance_after = run.variance[event_rows + 1, configuration_index]
+    fused_at_s = run.segment.time_s[events.end_step[event_rows], None]
     settings = run.configurations[configuration_index].settings
     # innovations exactly at the gate were clipped and fused; the factor covers rounding
-    limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
-    velocity_rejected = (nu[:, :3] ** 2 > limit * S[:, :3]).any(axis=1, keepdims=True)
+    velocity_limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
+    velocity_rejected = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1, keepdims=True)
     # position along north and east (m), then velocity along north, east and down (m/s)
-    position = [nu[:, 3:5], S[:, 3:5], flags, variance_after[:, 6:8], variance_after[:, 3:5]]
-    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3], velocity_rejected])
-    index = pd.Index(events.time_s[rows], name="time_s")
-    updates = pd.DataFrame(values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
+    position_columns = [
+        nu[:, 3:5],
+        S[:, 3:5],
+        decision_flags,
+        variance_after[:, 6:8],
+        variance_after[:, 3:5],
+    ]
+    update_values = np.hstack(
+        [*position_columns, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3], velocity_rejected]
+    )
+    index = pd.Index(events.time_s[event_rows], name="time_s")
+    updates = pd.DataFrame(update_values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
     return updates if np.isfinite(nu[:, :3]).any() else updates[UPDATE_COLUMNS]
 
 
@@ -442,14 +452,16 @@ def _delayed_and_published(
     configuration = run.configurations[configuration_index]
     state, reset = delayed_states(run, configuration_index)
     horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
-    lag = max(round(horizon_s / inputs.step_s), 1)
+    lag_steps = max(round(horizon_s / inputs.step_s), 1)
     published_rotation = np.zeros((len(state), 3))
     # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
     if configuration.estimates_attitude:
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
-        published_rotation = follow_attitude(attitude_difference, lag, inputs.step_s, horizon_s)
+        published_rotation = follow_attitude(
+            attitude_difference, lag_steps, inputs.step_s, horizon_s
+        )
     published_track = publish(
-        segment, state, reset, published_rotation, lag, configuration.settings
+        segment, state, reset, published_rotation, lag_steps, configuration.settings
     )
     heading = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
@@ -467,12 +479,12 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     configuration = run.configurations[configuration_index]
     segment = run.segment
     event_states = run.state[:, configuration_index]
-    count = len(segment.step_s)
-    rotation = segment.body_to_ned[1:]
-    dt = segment.step_s[:, None]
-    interval = np.searchsorted(event_steps, np.arange(count), side="right")
-    first_step = np.searchsorted(interval, interval)
-    state = event_states[np.append(0, interval)]
+    step_count = len(segment.step_s)
+    body_to_ned = segment.body_to_ned[1:]
+    step_s = segment.step_s[:, None]
+    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
+    first_step = np.searchsorted(interval_index, interval_index)
+    state = event_states[np.append(0, interval_index)]
 
     def sum_since_event(increments: Array) -> Array:
         total = np.cumsum(increments, axis=0)
@@ -481,25 +493,31 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     def value_before_step(after_step: Array, rows: slice) -> Array:
         shifted = np.concatenate([after_step[:1], after_step[:-1]])
         return np.where(
-            (first_step == np.arange(count))[:, None], event_states[interval, rows], shifted
+            (first_step == np.arange(step_count))[:, None],
+            event_states[interval_index, rows],
+            shifted,
         )
 
     # state equations of px4fuse.ekf2.intervals, evaluated for this state only
-    rotation_steps = -rotate(rotation, state[1:, GYRO_BIAS]) * dt
+    rotation_steps = -rotate(body_to_ned, state[1:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
         rotation_steps -= segment.correction_rad
     state[1:, THETA] += sum_since_event(rotation_steps)
-    force = rotate(rotation, segment.force_m_s2)
+    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2)
     acceleration = (
-        np.cross(value_before_step(state[1:, THETA], THETA), force) + force + GRAVITY_M_S2
+        np.cross(value_before_step(state[1:, THETA], THETA), force_ned_m_s2)
+        + force_ned_m_s2
+        + GRAVITY_M_S2
     )
-    acceleration -= rotate(rotation, state[1:, ACCELEROMETER_BIAS])
-    state[1:, VELOCITY] += sum_since_event(acceleration * dt)
+    acceleration -= rotate(body_to_ned, state[1:, ACCELEROMETER_BIAS])
+    state[1:, VELOCITY] += sum_since_event(acceleration * step_s)
     speed = state[1:, VELOCITY]
-    state[1:, POSITION] += sum_since_event(0.5 * dt * (value_before_step(speed, VELOCITY) + speed))
+    state[1:, POSITION] += sum_since_event(
+        0.5 * step_s * (value_before_step(speed, VELOCITY) + speed)
+    )
     state[event_steps] = event_states[1:]
-    reset = np.zeros((count + 1, 3))
+    reset_m = np.zeros((step_count + 1, 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
-        reset[event_steps[event_index] :, :2] += position_reset_m[event_index]
-    return state, reset
+        reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
+    return state, reset_m

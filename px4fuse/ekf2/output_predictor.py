@@ -34,7 +34,7 @@ def publish(
     state: Array,
     reset_m: Array,
     attitude_difference_rad: Array,
-    lag: int,
+    lag_steps: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
     """Return the published velocity (m/s) and position (m) after each of n prediction steps.
@@ -48,7 +48,7 @@ def publish(
         Sum of position resets up to each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
         Published minus nominal attitude.
-    lag : int
+    lag_steps : int
         Number of steps between fusion horizon and present.
     settings : mapping
         EKF2 parameters by PX4 name.
@@ -56,27 +56,27 @@ def publish(
     step_s = segment.step_s[:, None]
     mean_step = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    force = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
-    force = rotate(segment.body_to_ned[1:], force)
+    force_m_s2 = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
+    force_m_s2 = rotate(segment.body_to_ned[1:], force_m_s2)
     velocity_increments = (
-        force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2
+        force_m_s2 + np.cross(attitude_difference_rad[1:], force_m_s2) + GRAVITY_M_S2
     ) * step_s
     dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], velocity_increments]), axis=0)
     velocity_correction = _follow_offset(
-        state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]
+        state[:, VELOCITY] - dead_reckoned, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
     )
-    velocity = dead_reckoned + velocity_correction
+    velocity_m_s = dead_reckoned + velocity_correction
     # the IMU changes the velocity within a step; corrections apply at the end of the step
-    position_increments = (velocity[:-1] + 0.5 * velocity_increments) * step_s
+    position_increments = (velocity_m_s[:-1] + 0.5 * velocity_increments) * step_s
     # a reset is removed, because EKF2 shifts the whole buffer with a reset
     position_without_resets = state[:, POSITION] - reset_m
     dead_reckoned = np.cumsum(
         np.concatenate([position_without_resets[:1], position_increments]), axis=0
     )
-    position = dead_reckoned + _follow_offset(
-        position_without_resets - dead_reckoned, lag, mean_step, settings["EKF2_TAU_POS"]
+    position_m = dead_reckoned + _follow_offset(
+        position_without_resets - dead_reckoned, lag_steps, mean_step, settings["EKF2_TAU_POS"]
     )
-    return velocity, position + delay_by(reset_m, lag)
+    return velocity_m_s, position_m + delay_by(reset_m, lag_steps)
 
 
 def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -> Array:
@@ -85,11 +85,13 @@ def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -
     ``offset`` o is the state minus the output without corrections. With gain g and error e_k =
     o_(k-lag) - c_k, the sum of corrections is c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
-    g = step_s / np.clip(tau_s, step_s, 10.0)
-    h = INTEGRAL_GAIN * g**2
+    gain = step_s / np.clip(tau_s, step_s, 10.0)
+    integral_gain = INTEGRAL_GAIN * gain**2
     delayed_offset = delay_by(offset - offset[0], lag_steps)
     correction_sum = _recursive_filter(
-        np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), delayed_offset
+        np.array([gain + integral_gain, -gain]),
+        np.array([1.0, gain + integral_gain - 2.0, 1.0 - gain]),
+        delayed_offset,
     )
     return np.asarray(correction_sum + offset[0])
 

@@ -62,12 +62,12 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
     "velocity_rejected",
 ]
-# Minimum number of logged innovations for a comparison with the replay
+# Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_SAMPLES = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
-# Times with a smaller difference (s) are in the same prediction step
+# Maximum difference (s) of two times in the same prediction step
 SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
@@ -80,13 +80,13 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum position difference (m) while optical flow, which is logged at a reduced rate, is the only
 # horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# With a larger rejected fraction, only rejected fraction and mean NIS are compared, because one
-# sample near the gate changes many later ones. Single innovations are then compared in a replay
-# with the logged rejections
-MANY_REJECTIONS_FRACTION = 0.05
-# Rejected fraction above which EKF2's position is mostly integrated from the IMU: the published
-# position is then not tested, but the innovations must agree better
+# Maximum rejected fraction for a comparison of single innovations; with more rejections, one
+# sample near the gate changes many later innovations
+MAX_COMPARED_REJECTIONS = 0.05
+# Maximum rejected fraction for a comparison of the published position, which is otherwise mostly
+# integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
+# Minimum correlation of replayed and logged innovations if most positions are rejected
 MIN_IMU_CORRELATION = 0.99
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
@@ -256,39 +256,41 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         )
     aid = replayed_aid(ekf2)
     is_own_topic = aid_source(aid) in ekf2.innovation_topics
-    position = _compare_innovations(
+    position_agreement = _compare_innovations(
         ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
     )
-    if isinstance(position, str):
+    if isinstance(position_agreement, str):
         return Unavailable(
             ANALYSIS_NAME,
-            position,
+            position_agreement,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    rejected_in_log, rejected_in_replay = position.rejected_fractions
-    is_good, reason = _agreement_verdict(position.axes, rejected_in_log, rejected_in_replay)
-    agreements, doubtful_aids = _other_agreements(ekf2, replay)
-    velocity = _compare_velocity(ekf2, replay, is_own_topic)
-    if velocity == CONSTANT_INNOVATIONS:
-        doubtful_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
+    rejected_in_log, rejected_in_replay = position_agreement.rejected_fractions
+    is_good, reason = _agreement_verdict(
+        position_agreement.axes, rejected_in_log, rejected_in_replay
+    )
+    agreements, omitted_aids = _other_agreements(ekf2, replay)
+    velocity_agreement = _compare_velocity(ekf2, replay, is_own_topic)
+    if velocity_agreement == CONSTANT_INNOVATIONS:
+        omitted_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
-        doubtful_aids[FLOW.name] = (
+        omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
             f"positions differ by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
-    is_same_decision = (position.logged["rejected"] > 0.0).to_numpy() == (
-        position.replayed["rejected"] > 0.0
+    is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
+        position_agreement.replayed["rejected"] > 0.0
     )
-    distances_m = [axis.position_rms_difference_m for axis in position.axes.values()]
+    distances_m = [axis.position_rms_difference_m for axis in position_agreement.axes.values()]
     return Agreement(
-        north=position.axes["north"],
-        east=position.axes["east"],
-        gnss_vel={} if isinstance(velocity, str) else velocity.axes,
-        **(agreements | {aid.name: position.axes}),
-        doubtful=doubtful_aids,
-        samples=len(position.logged),
+        north=position_agreement.axes["north"],
+        east=position_agreement.axes["east"],
+        gnss_vel={} if isinstance(velocity_agreement, str) else velocity_agreement.axes,
+        **(agreements | {aid.name: position_agreement.axes}),
+        doubtful=omitted_aids,
+        samples=len(position_agreement.logged),
         rejected_fraction_logged=rejected_in_log,
         rejected_fraction_replayed=rejected_in_replay,
         decisions_same=float(np.mean(is_same_decision)),
@@ -331,12 +333,14 @@ def _compare_innovations(
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest horizontal position difference (m) with flow only; None without it."""
-    times = ekf2.state.index[inside_spans(ekf2.state.index, replay.flow_only_spans_s)].to_numpy()
-    if not len(times):
+    flow_only_s = ekf2.state.index[
+        inside_spans(ekf2.state.index, replay.flow_only_spans_s)
+    ].to_numpy()
+    if not len(flow_only_s):
         return None
     north, east = (
-        component_along(replay.published, Columns.POSITION, direction, times)
-        - component_along(ekf2.state, Columns.POSITION, direction, times)
+        component_along(replay.published, Columns.POSITION, direction, flow_only_s)
+        - component_along(ekf2.state, Columns.POSITION, direction, flow_only_s)
         for direction in np.eye(3)[:2]
     )
     return float(np.hypot(north, east).max())
@@ -349,8 +353,10 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     logged_state = logged_state[inside_spans(logged_state.index, replay.evaluated_s)]
     if logged_state.empty:
         return None
-    heading = replay.delayed["heading_rad"]
-    replayed_rad = np.interp(logged_state.index, heading.index, np.unwrap(heading))
+    replayed_heading_rad = replay.delayed["heading_rad"]
+    replayed_rad = np.interp(
+        logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
+    )
     difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged_state))))
     return float(np.degrees(rms(difference_rad)))
 
@@ -358,20 +364,27 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 def _compare_velocity(
     ekf2: Ekf2, replay: Ekf2Replay, is_own_topic: bool
 ) -> _ComparedInnovations | str:
-    log = ekf2.aids.get(GNSS_VEL.name)
-    if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
+    aid_log = ekf2.aids.get(GNSS_VEL.name)
+    if aid_log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
         return "GNSS velocity is not fused or not logged"
     # give the velocity columns the names of position columns
-    names: dict[str, str] = {}
+    renamed_columns: dict[str, str] = {}
     for axis in AXIS_NAMES:
         nu = f"innovation_{axis}_m"
         S = f"innovation_variance_{axis}_m2"
-        names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
+        renamed_columns |= {
+            f"{nu}_s": nu,
+            f"{S}_s2": S,
+            f"innovation_{axis}": nu,
+            f"variance_{axis}": S,
+        }
     return _compare_innovations(
         ekf2,
         replay,
-        replay.updates.filter([*VELOCITY_UPDATE_COLUMNS, "fused_at_s"]).rename(columns=names),
-        log.samples.rename(columns=names),
+        replay.updates.filter([*VELOCITY_UPDATE_COLUMNS, "fused_at_s"]).rename(
+            columns=renamed_columns
+        ),
+        aid_log.samples.rename(columns=renamed_columns),
         # without height fusion the replay uses the logged EKF2 height
         AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL,
         is_own_topic,
@@ -381,9 +394,9 @@ def _compare_velocity(
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the agreement of heights and of vision in addition to GNSS, and each disagreement."""
     agreements: dict[str, Any] = {}
-    doubtful_aids = {}
+    omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
-        log = ekf2.aids[name]
+        aid_log = ekf2.aids[name]
         # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
@@ -392,25 +405,25 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             ekf2,
             replay,
             matched_updates,
-            logged_aid_innovations(name, log),
+            logged_aid_innovations(name, aid_log),
             axes_of(updates),
-            aid_source(AIDS[name]) in log.topics,
+            aid_source(AIDS[name]) in aid_log.topics,
         )
         if isinstance(compared, str):
-            doubtful_aids[name] = compared
+            omitted_aids[name] = compared
             continue
         agreements[name] = compared.axes
         is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
         if not is_good:
-            doubtful_aids[name] = reason
-    return agreements, doubtful_aids
+            omitted_aids[name] = reason
+    return agreements, omitted_aids
 
 
-def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
+def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     """Return logged innovations, S and rejections of an aiding source (PX4's name)."""
-    gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
-    axes = [axis for axis in AXIS_NAMES if axis in log.axes]
-    return _columns_by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
+    gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
+    axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
+    return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
 
 
 def axes_of(updates: pd.DataFrame) -> list[AxisName]:
@@ -442,21 +455,21 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
     return is_inside
 
 
-def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) -> IntArray:
+def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
     ``is_own_topic`` is True for estimator_aid_src topics, which contain measurement times.
     """
     if is_own_topic:
-        return same_sample(updates.index.to_numpy(), times)
+        return same_sample(updates.index.to_numpy(), logged_s)
     fused_at = updates["fused_at_s"].to_numpy()
-    row = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
-    age = times - fused_at[np.maximum(row, 0)]
-    is_match = (row >= 0) & (age <= MAX_INNOVATION_AGE_S)
+    update_row = np.searchsorted(fused_at, logged_s + 1e-4, side="right") - 1
+    age_s = logged_s - fused_at[np.maximum(update_row, 0)]
+    is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # a row that is logged in the prediction step of a fusion may still contain the previous
     # innovation
-    is_clear = is_match & (age >= SAME_STEP_S)
-    return np.where(is_clear if is_clear.sum() > 0.5 * is_match.sum() else is_match, row, -1)
+    is_clear = is_match & (age_s >= SAME_STEP_S)
+    return np.where(is_clear if is_clear.sum() > 0.5 * is_match.sum() else is_match, update_row, -1)
 
 
 def _axis_agreement(
@@ -467,11 +480,13 @@ def _axis_agreement(
         innovations[f"innovation_variance_{axis}_m2"].to_numpy() for innovations in (model, log)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
-    times = ekf2.state.index[inside_spans(ekf2.state.index, replay.evaluated_s)].to_numpy()
+    evaluated_state_s = ekf2.state.index[
+        inside_spans(ekf2.state.index, replay.evaluated_s)
+    ].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
     position, velocity = (
-        component_along(replay.published, columns, direction, times)
-        - component_along(ekf2.state, columns, direction, times)
+        component_along(replay.published, columns, direction, evaluated_state_s)
+        - component_along(ekf2.state, columns, direction, evaluated_state_s)
         for columns in (Columns.POSITION, Columns.VELOCITY)
     )
     return AxisAgreement(
@@ -488,25 +503,29 @@ def _axis_agreement(
 
 
 def component_along(
-    vectors: pd.DataFrame, columns: list[str], direction: Array, times: Array
+    vectors: pd.DataFrame, columns: list[str], direction: Array, times_s: Array
 ) -> Array:
     """Interpolate the component of a vector (NED columns) along a direction."""
     component = signals.weighted_sum(vectors, columns, direction[: len(columns)])
-    return np.asarray(np.interp(times, vectors.index, component))
+    return np.asarray(np.interp(times_s, vectors.index, component))
 
 
-def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
+def rms_to_truth(
+    flight: Flight, position_m: Array, direction: Array, times_s: Array
+) -> float | None:
     """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
     samples = flight.truth.samples
-    component = signals.weighted_sum(samples, Columns.POSITION, direction)
-    is_known = np.isfinite(component)
+    true_component_m = signals.weighted_sum(samples, Columns.POSITION, direction)
+    is_known = np.isfinite(true_component_m)
     if not is_known.any():
         return None
-    truth = np.interp(times, samples.index[is_known], component[is_known], np.nan, np.nan)
-    error = (position - truth)[np.isfinite(truth)]
-    return rms(error) if len(error) else None
+    true_position_m = np.interp(
+        times_s, samples.index[is_known], true_component_m[is_known], np.nan, np.nan
+    )
+    error_m = (position_m - true_position_m)[np.isfinite(true_position_m)]
+    return rms(error_m) if len(error_m) else None
 
 
 def rms(values: Array) -> float:
@@ -521,11 +540,11 @@ def _agreement_verdict(
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the reason with numbers."""
     s_ratios = (axis.s_ratio_median for axis in axes.values())
-    ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
-    if abs(ratio - 1.0) > MAX_S_DIFFERENCE:
+    worst_s_ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
+    if abs(worst_s_ratio - 1.0) > MAX_S_DIFFERENCE:
         return False, (
-            f"the innovation variance of the replay is {ratio:.2f} times the logged one (tolerance "
-            f"{MAX_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the log"
+            f"the innovation variance of the replay is {worst_s_ratio:.2f} times the logged one "
+            f"(tolerance {MAX_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
@@ -541,15 +560,17 @@ def _agreement_verdict(
                 "lacks an input of EKF2's output predictor"
             )
         return True, f"{correlation_text}"
-    if max(rejected_in_log, rejected_in_replay) < MANY_REJECTIONS_FRACTION:
+    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTIONS:
         return False, f"{correlation_text}, below the minimum of {MIN_CORRELATION:g}"
     rejected_difference = abs(rejected_in_replay - rejected_in_log)
-    nis = max(abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values())
+    nis_difference = max(
+        abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
+    )
     text = (
         f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
-        f"the mean NIS differs by {nis:.0%}"
+        f"the mean NIS differs by {nis_difference:.0%}"
     )
-    if rejected_difference > MAX_REJECTED_DIFFERENCE or nis > MAX_NIS_DIFFERENCE:
+    if rejected_difference > MAX_REJECTED_DIFFERENCE or nis_difference > MAX_NIS_DIFFERENCE:
         return False, (
             f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
@@ -570,22 +591,22 @@ def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> A
     With many rejections, one sample near the gate makes a correct replay differ from the log.
     ``agreement`` is of the replay with the gate of the model.
     """
-    rejected = agreement.rejected_fraction_logged
-    relies_on_imu = rejected > MOSTLY_REJECTED_FRACTION
+    rejected_fraction = agreement.rejected_fraction_logged
+    relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
     published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
     is_good, reason = _agreement_verdict(with_decisions.axes, 0.0, 0.0, published_factor)
-    correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
-    if is_good and relies_on_imu and correlation < MIN_IMU_CORRELATION:
+    min_correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
+    if is_good and relies_on_imu and min_correlation < MIN_IMU_CORRELATION:
         is_good = False
         reason = (
-            f"the correlation {correlation:.4f} of replayed and logged innovations is below the "
-            f"minimum of {MIN_IMU_CORRELATION:g}"
+            f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
+            f"the minimum of {MIN_IMU_CORRELATION:g}"
         )
     reason = f"in a replay with EKF2's logged rejections, {reason}"
     if relies_on_imu and not is_good:
         reason += (
-            f". EKF2 rejected {rejected:.0%} of the positions and relied on the IMU. The frame of "
-            "the source is probably wrong"
+            f". EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the IMU. The "
+            "frame of the source is probably wrong"
         )
     return replace(
         with_decisions,

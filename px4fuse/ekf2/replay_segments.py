@@ -42,9 +42,9 @@ MIN_FUSION_S = 1.0
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from the first fusion of all magnetometer axes until the reset field states are logged
+# Time (s) from the first fusion of all magnetometer axes to the log of the reset field states
 FIELD_RESET_S = 1.0
-# Flight time (s) before the replay from which the correlations of the initial state are estimated
+# Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15)
 MAG_FUSION_HZ = 14.0
@@ -56,9 +56,9 @@ INNOVATION_FILTER_S = 0.5
 MIN_SEGMENT_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# The replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
+# Maximum fraction of clipped IMU samples within 1 s in an EKF2 replay
 MAX_CLIPPED_FRACTION = 0.05
-# A smaller fraction of missing IMU samples is ignored
+# Maximum fraction of missing IMU samples that is ignored in an EKF2 replay
 MAX_LOST_IMU_FRACTION = 0.02
 
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
@@ -157,7 +157,7 @@ class ReplaySegment:
         Published height (positive down), and its variance.
     attitude_error_rad, attitude_variance_rad2 : ndarray, shape (n + 1, 3)
         Logged attitude minus nominal attitude, and its variance.
-    correlation : ndarray, shape (15, 15) or (21, 21)
+    state_correlation : ndarray, shape (15, 15) or (21, 21)
         Estimated correlations of the initial state.
     field, flow : SensorSamples or None
     heights : HeightSamples or None
@@ -187,7 +187,7 @@ class ReplaySegment:
     attitude_variance_rad2: Array
     down_variance_m2: Array
     attitude_error_rad: Array
-    correlation: Array
+    state_correlation: Array
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
@@ -245,24 +245,29 @@ def samples_by_event(
         Position moved to the event by the IMU acceleration, age (s), ``more``, and 1 for a sample;
         0 in empty slots.
     """
-    event = np.searchsorted(event_steps, measurement_step)
-    event = event[event < len(event_steps)]
-    count = len(event)
-    measurement_step = measurement_step[:count]
-    event_step = event_steps[event]
+    event_index = np.searchsorted(event_steps, measurement_step)
+    event_index = event_index[event_index < len(event_steps)]
+    sample_count = len(event_index)
+    measurement_step = measurement_step[:sample_count]
+    event_step = event_steps[event_index]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
-    displacement = segment.imu_displacement_m[:, axes]
-    velocity = segment.imu_velocity_m_s[:, axes]
-    displacement = (
-        displacement[event_step]
-        - displacement[measurement_step]
-        - velocity[event_step] * age_s[:, None]
+    displacement_m = segment.imu_displacement_m[:, axes]
+    velocity_m_s = segment.imu_velocity_m_s[:, axes]
+    displacement_m = (
+        displacement_m[event_step]
+        - displacement_m[measurement_step]
+        - velocity_m_s[event_step] * age_s[:, None]
     )
-    slot = np.arange(count) - np.searchsorted(event, event)
-    position_m = position_m[:count] + displacement
-    columns = *position_m.T, age_s, *(column[:count] for column in more), np.ones(count)
-    samples = np.zeros((len(columns), slot.max(initial=-1) + 1, len(event_steps)))
-    samples[:, slot, event] = columns
+    slot_index = np.arange(sample_count) - np.searchsorted(event_index, event_index)
+    position_m = position_m[:sample_count] + displacement_m
+    columns = (
+        *position_m.T,
+        age_s,
+        *(column[:sample_count] for column in more),
+        np.ones(sample_count),
+    )
+    samples = np.zeros((len(columns), slot_index.max(initial=-1) + 1, len(event_steps)))
+    samples[:, slot_index, event_index] = columns
     return samples
 
 
@@ -280,7 +285,7 @@ def find_replay_segments(
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
-    record: FusionRecord,
+    fusion_record: FusionRecord,
     source_s: Array,
     *,
     is_gnss: bool = False,
@@ -292,22 +297,22 @@ def find_replay_segments(
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     fused_s = innovations.index.to_numpy()
-    state_times_s = record.delayed.index.to_numpy()
-    time = imu.index.to_numpy()
-    cut_times_s = [time[0], time[-1]]
-    for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
-        gap_rows = np.flatnonzero(np.diff(stamps) > limit)
-        cut_times_s += [*stamps[gap_rows], *stamps[gap_rows + 1]]
+    state_times_s = fusion_record.delayed.index.to_numpy()
+    imu_s = imu.index.to_numpy()
+    cut_times_s = [imu_s[0], imu_s[-1]]
+    for sample_times_s, limit in ((imu_s, IMU_GAP_S), (source_s, RESTART_GAP_S)):
+        gap_rows = np.flatnonzero(np.diff(sample_times_s) > limit)
+        cut_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
     cut_times_s += _break_times_s(imu, ekf2) if is_gnss else ()
     first_s = max(attitude.index[0], source_s[0])
     end_s = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    field_span = _field_span(record) if is_gnss else None
+    field_span = _field_span(fusion_record) if is_gnss else None
     cut_times_s += field_span[1:] if field_span else ()
     # another primary EKF2 instance has another state
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
-    changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
-    cut_times_s += [change.time_s for change in changes]
+    parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
+    cut_times_s += [change.time_s for change in parameter_changes]
     segments = []
     for low, high in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
         fused_inside = fused_s[(fused_s >= low) & (fused_s <= high)]
@@ -315,19 +320,25 @@ def find_replay_segments(
             continue
         # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
         # the segment
-        starts = [start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high]
+        earliest_starts_s = [
+            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high
+        ]
         if field_span and low <= field_span[0] < high:
-            starts.append(field_span[0])
+            earliest_starts_s.append(field_span[0])
         start_row = int(
-            np.searchsorted(state_times_s, max([fused_inside[0] + MIN_FUSION_S, *starts]))
+            np.searchsorted(
+                state_times_s, max([fused_inside[0] + MIN_FUSION_S, *earliest_starts_s])
+            )
         )
         if start_row == len(state_times_s) or high - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (time[1:] > state_times_s[start_row]) & (time[:-1] < high)
-        if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
+        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high)
+        if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
             continue
-        segment_inputs = imu, attitude, ekf2, record
-        changed = {change.name: change.after for change in changes if change.time_s <= low}
+        segment_inputs = imu, attitude, ekf2, fusion_record
+        changed = {
+            change.name: change.after for change in parameter_changes if change.time_s <= low
+        }
         make_segment = _make_gnss_segment if is_gnss else _make_segment
         segment = make_segment(*segment_inputs, start_row, high)
         history_row = int(
@@ -339,7 +350,7 @@ def find_replay_segments(
             history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
         if field_span and field_span[0] <= state_times_s[start_row] and high <= field_span[1]:
-            segment = _add_field(segment, record, start_row, ekf2.step_s)
+            segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed=changed))
     return tuple(segments)
 
@@ -348,22 +359,22 @@ def _make_gnss_segment(
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
-    record: FusionRecord,
+    fusion_record: FusionRecord,
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
     """Make a segment with earth rotation, positions in EKF2's metres, and bad accelerations."""
-    segment = _make_segment(imu, attitude, ekf2, record, start_row, end_s)
-    metres_per_metre = ekf2_metres_per_metre(record)
-    state = segment.state.copy()
-    state[POSITION] *= metres_per_metre
-    earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
+    segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
+    metres_per_metre = ekf2_metres_per_metre(fusion_record)
+    initial_state = segment.state.copy()
+    initial_state[POSITION] *= metres_per_metre
+    earth_rotation_rad = earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
     start_s, end_s = segment.time_s[[0, -1]]
-    velocity = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
-    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity)[0]
+    velocity_down_m_s = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
+    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity_down_m_s)[0]
     return replace(
         segment,
-        state=state,
+        state=initial_state,
         ekf2_metres_per_metre=metres_per_metre,
         correction_rad=segment.correction_rad + earth_rotation_rad,
         clipped_fraction=_clipped_fraction(imu, segment.time_s),
@@ -380,11 +391,11 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         for time in (reset.time_s - MAX_RESET_DELAY_S, reset.time_s)
     ]
     if "clipped" in imu:
-        times = imu.index.to_numpy()
-        clipped_s = times[imu["clipped"].to_numpy() > 0.0]
+        imu_s = imu.index.to_numpy()
+        clipped_s = imu_s[imu["clipped"].to_numpy() > 0.0]
         begin, end = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
         clipped_moments = clipped_s[
-            end - begin > MAX_CLIPPED_FRACTION / float(np.median(np.diff(times)))
+            end - begin > MAX_CLIPPED_FRACTION / float(np.median(np.diff(imu_s)))
         ]
         break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return break_times_s
@@ -407,107 +418,126 @@ def _make_segment(
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
-    record: FusionRecord,
+    fusion_record: FusionRecord,
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    start = record.delayed.iloc[start_row].astype(np.float64)
-    time = imu.index.to_numpy()
-    first_row = int(np.argmin(np.abs(time - record.delayed.index[start_row])))
-    rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
-    time = time[rows]
-    imu = imu.iloc[rows]
-    interval = np.diff(time)
-    end_stamps = rows_of_timestamps(time, record.delayed.index)
-    ends = step_ends(interval, end_stamps, predict_s(record))
-    bias = np.asarray(start[Columns.ACCELEROMETER_BIAS])
-    rate = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(start[Columns.GYRO_BIAS])
-    force = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - bias
-    rotation_vectors, velocity_increments = downsample_imu(
-        rate * interval[:, None], force * interval[:, None], ends
+    initial_row = fusion_record.delayed.iloc[start_row].astype(np.float64)
+    imu_s = imu.index.to_numpy()
+    first_row = int(np.argmin(np.abs(imu_s - fusion_record.delayed.index[start_row])))
+    segment_rows = slice(first_row, int(np.searchsorted(imu_s, end_s, side="right")))
+    imu_s = imu_s[segment_rows]
+    imu = imu.iloc[segment_rows]
+    imu_intervals_s = np.diff(imu_s)
+    end_stamps = rows_of_timestamps(imu_s, fusion_record.delayed.index)
+    step_end_indices = step_ends(imu_intervals_s, end_stamps, predict_s(fusion_record))
+    accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
+    rate_rad_s = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(
+        initial_row[Columns.GYRO_BIAS]
     )
-    times = time[np.append(0, ends)]
-    step = np.diff(times)
-    gyro = cumulative_product(
+    force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - accelerometer_bias
+    rotation_vectors, velocity_increments = downsample_imu(
+        rate_rad_s * imu_intervals_s[:, None],
+        force_m_s2 * imu_intervals_s[:, None],
+        step_end_indices,
+    )
+    step_times_s = imu_s[np.append(0, step_end_indices)]
+    step_s = np.diff(step_times_s)
+    gyro_attitude = cumulative_product(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
     )
 
     def relative_attitude(
         attitude_samples: pd.DataFrame, early_s: float, end_attitude: Array
     ) -> ArrayPair:
-        attitude_samples = attitude_samples.loc[times[0] - early_s : times[-1]]
+        attitude_samples = attitude_samples.loc[step_times_s[0] - early_s : step_times_s[-1]]
         at_s = attitude_samples.index.to_numpy()
-        rotation = conjugate(interpolate(at_s, times, end_attitude))
-        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), rotation)
+        end_rotation = conjugate(interpolate(at_s, step_times_s, end_attitude))
+        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), end_rotation)
 
     # published attitude relative to the integrated gyro, in NED
-    extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
-    nominal = multiply(extra_rotation, gyro)
-    states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)
-    error = to_vector(state_rotation)
-    published_m = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
-    position = start[Columns.POSITION].to_numpy()
-    position = np.where(np.isfinite(position), position, published_m)
+    extra_rotation = interpolate(step_times_s, *relative_attitude(attitude, 0.0, gyro_attitude))
+    nominal_attitude = multiply(extra_rotation, gyro_attitude)
+    state_times_s, state_rotation = relative_attitude(fusion_record.delayed, 1e-4, nominal_attitude)
+    attitude_error_rad = to_vector(state_rotation)
+    published_m = [
+        np.interp(step_times_s[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION
+    ]
+    position_m = initial_row[Columns.POSITION].to_numpy()
+    position_m = np.where(np.isfinite(position_m), position_m, published_m)
     # from PX4 v1.16 on, the height of the state has another origin than the published height
-    position[2] = published_m[2]
+    position_m[2] = published_m[2]
     return ReplaySegment(
-        time_s=times,
-        step_s=step,
-        body_to_ned=to_matrix(nominal),
+        time_s=step_times_s,
+        step_s=step_s,
+        body_to_ned=to_matrix(nominal_attitude),
         correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
-        force_m_s2=velocity_increments / step[:, None],
-        accelerometer_bias_m_s2=bias,
-        state=np.concatenate([error[0], start[Columns.VELOCITY], position, np.zeros(6)]),
-        variance=np.asarray(start[Columns.DELAYED_VARIANCE[:15]]),
-        down_m=_interpolate(ekf2.state["down_m"], times),
+        force_m_s2=velocity_increments / step_s[:, None],
+        accelerometer_bias_m_s2=accelerometer_bias,
+        state=np.concatenate(
+            [attitude_error_rad[0], initial_row[Columns.VELOCITY], position_m, np.zeros(6)]
+        ),
+        variance=np.asarray(initial_row[Columns.DELAYED_VARIANCE[:15]]),
+        down_m=_interpolate(ekf2.state["down_m"], step_times_s),
         attitude_variance_rad2=np.column_stack(
-            [_interpolate(record.delayed[name], times) for name in Columns.DELAYED_VARIANCE[:3]]
+            [
+                _interpolate(fusion_record.delayed[name], step_times_s)
+                for name in Columns.DELAYED_VARIANCE[:3]
+            ]
         ),
-        down_variance_m2=_interpolate(record.delayed["down_m2"], times),
+        down_variance_m2=_interpolate(fusion_record.delayed["down_m2"], step_times_s),
         attitude_error_rad=np.column_stack(
-            [np.interp(times, states, component) for component in error.T]
+            [
+                np.interp(step_times_s, state_times_s, component)
+                for component in attitude_error_rad.T
+            ]
         ),
-        correlation=np.eye(15),
+        state_correlation=np.eye(15),
         is_acceleration_bad=(
-            record.was_in_state(BAD_ACCELERATION, times)
-            if BAD_ACCELERATION in record.states
+            fusion_record.was_in_state(BAD_ACCELERATION, step_times_s)
+            if BAD_ACCELERATION in fusion_record.states
             else None
         ),
     )
 
 
-def _field_span(record: FusionRecord) -> Span | None:
+def _field_span(fusion_record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all magnetometer axes; None if interrupted."""
     is_fused_3d = (
-        record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
+        fusion_record.field_gauss["fused_3d"]
+        if len(fusion_record.field_gauss)
+        else pd.Series(dtype=float)
     )
-    times = is_fused_3d.index.to_numpy()
+    fused_3d_s = is_fused_3d.index.to_numpy()
     is_fused = is_fused_3d.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_MAG_LOG_HZ:
+    if not is_fused.any() or 1.0 / np.median(np.diff(fused_3d_s)) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
         return None
-    return float(times[first_row]) + FIELD_RESET_S, float(times[last_row])
+    return float(fused_3d_s[first_row]) + FIELD_RESET_S, float(fused_3d_s[last_row])
 
 
 def _add_field(
-    segment: ReplaySegment, record: FusionRecord, start_row: int, step_s: float
+    segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
-    start = record.delayed.iloc[start_row]
-    field_gauss = record.field_gauss
-    stamps = field_gauss.index.to_numpy()
-    age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    weight = max(MAG_FUSION_HZ * float(np.median(np.diff(stamps))), 1.0)
-    gauss = field_gauss.iloc[:, :3].to_numpy()
-    fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
-    variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
-    extended = add_field_states(segment, stamps - age_s, gauss, weight, fields, variance)
+    initial_row = fusion_record.delayed.iloc[start_row]
+    field_gauss = fusion_record.field_gauss
+    sample_times_s = field_gauss.index.to_numpy()
+    age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
+    samples_per_row = max(MAG_FUSION_HZ * float(np.median(np.diff(sample_times_s))), 1.0)
+    field_values = field_gauss.iloc[:, :3].to_numpy()
+    field_states = np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
+    variance = np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]])
+    extended_segment = add_field_states(
+        segment, sample_times_s - age_s, field_values, samples_per_row, field_states, variance
+    )
     if Columns.FIELD_INNOVATION[0] not in field_gauss:
-        return extended
+        return extended_segment
     filtered_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
-        extended, field=_mean_field(segment, record.delayed, stamps - age_s, filtered_gauss)
+        extended_segment,
+        field=_mean_field(segment, fusion_record.delayed, sample_times_s - age_s, filtered_gauss),
     )
 
 
@@ -520,14 +550,18 @@ def _mean_field(
     """
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
-    rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
-    measured_at_s = measured_at_s[rows]
-    between_s = between_s[rows - 1]
-    count = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
-    share = between_s / (between_s + count * INNOVATION_FILTER_S)
-    decay = ((1.0 - share) ** count)[:, None]
-    innovation = (filtered_gauss[rows] - decay * filtered_gauss[rows - 1]) / (1.0 - decay)
-    step, weight = low_pass_weights(segment, measured_at_s, count, between_s / count, share)
+    gap_free_rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
+    measured_at_s = measured_at_s[gap_free_rows]
+    between_s = between_s[gap_free_rows - 1]
+    fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
+    filter_share = between_s / (between_s + fused_counts * INNOVATION_FILTER_S)
+    remaining_fraction = ((1.0 - filter_share) ** fused_counts)[:, None]
+    innovation = (
+        filtered_gauss[gap_free_rows] - remaining_fraction * filtered_gauss[gap_free_rows - 1]
+    ) / (1.0 - remaining_fraction)
+    step, weight = low_pass_weights(
+        segment, measured_at_s, fused_counts, between_s / fused_counts, filter_share
+    )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
     earth, body = (
         np.column_stack(
@@ -542,7 +576,9 @@ def _mean_field(
         np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body
     )
     mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
-    return SensorSamples(step[:, 0], expected_field - innovation, mean, count, np.zeros(len(rows)))
+    return SensorSamples(
+        step[:, 0], expected_field - innovation, mean, fused_counts, np.zeros(len(gap_free_rows))
+    )
 
 
 def low_pass_weights(
@@ -558,10 +594,12 @@ def low_pass_weights(
         Weight of a new sample in the low-pass filter.
     """
     # age of a sample, in sample intervals
-    age = np.arange(int(count.max(initial=1.0)))
-    weight = np.where(age < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** age, 0.0)
+    sample_age = np.arange(int(count.max(initial=1.0)))
+    weight = np.where(
+        sample_age < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** sample_age, 0.0
+    )
     weight /= weight.sum(axis=1, keepdims=True)
-    measured_at_s = newest_s[:, None] - age * interval_s[:, None]
+    measured_at_s = newest_s[:, None] - sample_age * interval_s[:, None]
     return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
 
 
@@ -584,30 +622,34 @@ def add_field_states(
     fields, variance : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
-    step, is_inside = sample_steps(segment, measured_at_s)
-    rotation_to_body = segment.body_to_ned[step].transpose(0, 2, 1)
-    count = len(step)
+    step_index, is_inside = sample_steps(segment, measured_at_s)
+    rotation_to_body = segment.body_to_ned[step_index].transpose(0, 2, 1)
+    sample_count = len(step_index)
     return replace(
         segment,
         state=np.concatenate([segment.state, fields]),
         variance=np.concatenate([segment.variance, variance]),
-        correlation=block_diag(segment.correlation, np.eye(len(fields))),
+        state_correlation=block_diag(segment.state_correlation, np.eye(len(fields))),
         field=SensorSamples(
-            step, gauss[is_inside], rotation_to_body, np.full(count, weight), np.zeros(count)
+            step_index,
+            gauss[is_inside],
+            rotation_to_body,
+            np.full(sample_count, weight),
+            np.zeros(sample_count),
         ),
     )
 
 
 def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
     """Return the prediction step that fuses each sample, and a mask of samples in the segment."""
-    step = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
-    is_inside = (step > 0) & (step < len(segment.time_s))
-    return step[is_inside], is_inside
+    step_index = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
+    is_inside = (step_index > 0) & (step_index < len(segment.time_s))
+    return step_index[is_inside], is_inside
 
 
-def predict_s(record: FusionRecord) -> float:
+def predict_s(fusion_record: FusionRecord) -> float:
     """Return EKF2_PREDICT_US in seconds."""
-    return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
+    return fusion_record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
 def _interpolate(series: pd.Series, times: Array) -> Array:
@@ -628,30 +670,30 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
     samples_needed = samples_per_step(target_s, median_s, end_counts)
     logged_end_set = set(logged_ends.tolist())
-    ends = []
-    count = total = 0.0
+    end_indices = []
+    accumulated_count = accumulated_s = 0.0
     for sample, (interval, sample_count) in enumerate(
         zip(interval_s.tolist(), sample_counts.tolist(), strict=True), start=1
     ):
-        count = count + sample_count
-        total = total + interval
-        is_complete = count >= samples_needed and total > 0.5 * target_s
-        if is_complete or total > target_s or sample in logged_end_set:
-            ends.append(sample)
-            count = total = 0.0
-    return np.array(ends, dtype=np.intp)
+        accumulated_count = accumulated_count + sample_count
+        accumulated_s = accumulated_s + interval
+        is_complete = accumulated_count >= samples_needed and accumulated_s > 0.5 * target_s
+        if is_complete or accumulated_s > target_s or sample in logged_end_set:
+            end_indices.append(sample)
+            accumulated_count = accumulated_s = 0.0
+    return np.array(end_indices, dtype=np.intp)
 
 
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, ends: IntArray
 ) -> ArrayPair:
     """Return rotation and velocity change of each prediction step, body frame at the step's end."""
-    starts = np.append(0, ends[:-1])
+    start_indices = np.append(0, ends[:-1])
     summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
-    end_rotation = np.repeat(summed_rotation[ends], ends - starts, axis=0)
-    count = len(end_rotation)
-    middle_rotation = 0.5 * (summed_rotation[:count] + summed_rotation[1 : count + 1])
-    increments = velocity_increments[:count]
+    end_rotation = np.repeat(summed_rotation[ends], ends - start_indices, axis=0)
+    step_count = len(end_rotation)
+    middle_rotation = 0.5 * (summed_rotation[:step_count] + summed_rotation[1 : step_count + 1])
+    increments = velocity_increments[:step_count]
     increments = increments - np.cross(end_rotation - middle_rotation, increments)
-    step_rotation = summed_rotation[ends] - summed_rotation[starts]
-    return step_rotation, np.add.reduceat(increments, starts, axis=0)
+    step_rotation = summed_rotation[ends] - summed_rotation[start_indices]
+    return step_rotation, np.add.reduceat(increments, start_indices, axis=0)

@@ -47,7 +47,7 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "rejections and resets"
 OUTPUT = "output predictor"
-# Order of the replacements; further aiding sources of EKF2 precede GATE
+# Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
 STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
@@ -165,50 +165,56 @@ def explain_by_steps(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = step_configurations(model.inputs, settings or Settings())
-    delayed = delayed_tracks(model, list(configurations.values()))
+    delayed_positions = delayed_tracks(model, list(configurations.values()))
     flown_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.flown.evaluated_s
-    times = ekf2.state.index.to_numpy()
-    is_inside = inside_spans(times, evaluated_spans)
+    state_times_s = ekf2.state.index.to_numpy()
+    is_inside = inside_spans(state_times_s, evaluated_spans)
     # compare only at times that the replay and all KF runs cover
     for index in (flown_replay.delayed.index, *(run.steps.index for run in (runs or {}).values())):
-        is_inside &= (times >= index[0]) & (times <= index[-1])
-    times = times[is_inside]
-    if not len(times):
+        is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
+    state_times_s = state_times_s[is_inside]
+    if not len(state_times_s):
         return Unavailable(
             ANALYSIS_NAME,
             "the times of KF and of the EKF2 replay do not overlap",
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
-    span = float(times[0]), float(times[-1])
+    state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    stages = []
+    stage_names = []
     # tracks are computed one at a time, to limit memory
-    tracks = chain(delayed, (flown_replay.published, ekf2.state))
+    tracks = chain(delayed_positions, (flown_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
-        stages.append(
+        stage_names.append(
             [
-                [component_along(track, columns, direction, times) for columns in TRACK_COLUMNS]
+                [
+                    component_along(track, columns, direction, state_times_s)
+                    for columns in TRACK_COLUMNS
+                ]
                 for direction in directions.values()
             ]
         )
         if stage == [*configurations][-2]:  # all EKF2 properties but gate and output predictor
             without_gate = track
-    spans = Segment(*span, "").cut(evaluated_spans)
-    longest_rejection = _longest_rejection(flown_replay, without_gate, span, evaluated_spans)
+    spans = Segment(*state_span_s, "").cut(evaluated_spans)
+    longest_rejection = _longest_rejection(
+        flown_replay, without_gate, state_span_s, evaluated_spans
+    )
     truth = model.flight.truth
     steps_by_axis = {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
+        kf_state = state_at(runs[axis], state_times_s) if runs else stage_names[0][axis_index]
         # position and velocity of KF, of k replays, and of the logged EKF2: shape (k + 2, 2, n)
-        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
-        difference = positions_by_step - positions_by_step[-1]
-        errors = [
-            rms_to_truth(model.flight, track, direction, times) for track in positions_by_step[:, 0]
+        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stage_names)])
+        difference_by_step_m = positions_by_step - positions_by_step[-1]
+        rmse_by_step = [
+            rms_to_truth(model.flight, track, direction, state_times_s)
+            for track in positions_by_step[:, 0]
         ]
-        mean_squares = np.mean(difference[:-1] ** 2, axis=2)
+        mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
         position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
         steps = tuple(
             Step(
@@ -216,23 +222,23 @@ def explain_by_steps(
                 position_mean_square_m2=position_reduction,
                 velocity_mean_square_m2_s2=velocity_reduction,
                 position_moved_m=float(change.max()),
-                moved_at_s=float(times[change.argmax()]),
+                moved_at_s=float(state_times_s[change.argmax()]),
                 position_rmse_to_truth_m=error,
             )
             for name, (position_reduction, velocity_reduction), change, error in zip(
                 (*configurations, OUTPUT),
                 (mean_squares[:-1] - mean_squares[1:]).tolist(),
                 position_change,
-                errors[1:-1],
+                rmse_by_step[1:-1],
                 strict=True,
             )
         )
         (position, velocity), *_, (unexplained_position, unexplained_velocity) = (
             mean_squares.tolist()
         )
-        filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
+        filter_errors = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
         steps_by_axis[axis] = DifferenceExplanation(
-            count=len(times),
+            count=len(state_times_s),
             position_mean_square_m2=position,
             velocity_mean_square_m2_s2=velocity,
             steps=steps,
@@ -243,10 +249,10 @@ def explain_by_steps(
             },
             spans_s=spans,
             longest_rejection=longest_rejection,
-            times_s=times,
+            times_s=state_times_s,
             # copies, because a view would keep the tracks of all replays in memory
-            kf_minus_ekf2_m=difference[0, 0].copy(),
-            unexplained_m=difference[-2, 0].copy(),
+            kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
+            unexplained_m=difference_by_step_m[-2, 0].copy(),
         )
     return steps_by_axis
 
@@ -262,8 +268,8 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
     applied_delay_s = flown_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
-    aids = modelled_aids(inputs)
-    other_aids = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
+    replayed_aids = modelled_aids(inputs)
+    other_aids = [name for name in (FLOW.name, EV_POS.name) if name in replayed_aids[1:]]
     kf_configuration = FilterConfiguration(
         kf_parameters,
         estimates_biases=False,
@@ -287,16 +293,16 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
             )
         ),
     }
-    if MAG.name in aids:
+    if MAG.name in replayed_aids:
         configurations[FIELD_STEP] = configuration = replace(
             configuration, without=dict.fromkeys(other_aids, 0.0)
         )
     if inputs.received.velocity_m_s is not None:
         configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
-    for position, name in enumerate(other_aids, start=1):
+    for insertion_index, name in enumerate(other_aids, start=1):
         step = FLOW_STEP if name == FLOW.name else VISION_STEP
         configurations[step] = configuration = replace(
-            configuration, without=dict.fromkeys(other_aids[position:], 0.0)
+            configuration, without=dict.fromkeys(other_aids[insertion_index:], 0.0)
         )
     return configurations | {GATE: FilterConfiguration(flown_settings, uses_logged_decisions=True)}
 
@@ -307,24 +313,24 @@ def _longest_rejection(
     updates = flown_replay.updates[inside_spans(flown_replay.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
-    time = updates["fused_at_s"].to_numpy()
+    fused_at_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
     # a run of rejections lasts from the first rejected sample to the next fused sample
-    change = np.diff(is_rejected.astype(int), prepend=0, append=0)
-    starts = np.flatnonzero(change == 1)
-    ends = np.flatnonzero(change == -1)
-    longest_index = int(np.argmax(ends - starts))
-    begin = time[starts[longest_index]]
-    end = time[min(ends[longest_index], len(time) - 1)]
-    with_gate = flown_replay.delayed.loc[begin:end]
+    rejection_change = np.diff(is_rejected.astype(int), prepend=0, append=0)
+    run_starts = np.flatnonzero(rejection_change == 1)
+    run_ends = np.flatnonzero(rejection_change == -1)
+    longest_index = int(np.argmax(run_ends - run_starts))
+    begin_s = fused_at_s[run_starts[longest_index]]
+    end_s = fused_at_s[min(run_ends[longest_index], len(fused_at_s) - 1)]
+    with_gate = flown_replay.delayed.loc[begin_s:end_s]
     position_difference = [
         with_gate[column] - np.interp(with_gate.index, without_gate.index, without_gate[column])
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(
-        start_s=float(begin),
-        samples=int(ends[longest_index] - starts[longest_index]),
-        duration_s=float(end - begin),
+        start_s=float(begin_s),
+        samples=int(run_ends[longest_index] - run_starts[longest_index]),
+        duration_s=float(end_s - begin_s),
         distance_m=float(np.max(np.hypot(*position_difference))),
     )

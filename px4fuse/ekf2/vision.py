@@ -29,8 +29,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # Maximum time (s) without a vision sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
-# Maximum time (s) with all vision samples outside the gate, before EKF2 resets the vision bias or
-# the position (no_aid_timeout_max, common.h)
+# Time (s) with all vision samples outside the gate after which EKF2 resets the vision bias or the
+# position (no_aid_timeout_max, common.h)
 MAX_REJECTED_S = 1.0
 
 
@@ -52,16 +52,26 @@ def vision_samples(
     assert vision is not None
     measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
     due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
-    step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
-    is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
+    step_index = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
+    is_usable = (
+        (step_index > 0) & (step_index < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
+    )
     is_usable &= np.isfinite(vision.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
-    is_usable[:-1] &= step[1:] > step[:-1]
-    step = step[is_usable]
+    is_usable[:-1] &= step_index[1:] > step_index[:-1]
+    step_index = step_index[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
-    position_m = (vision.position_m[is_usable] - segment.body_to_ned[step] @ lever_arm_m)[:, :2]
-    more_columns = measured_at_s[is_usable], time_s[step], *vision.variance_m2[is_usable, :2].T
-    return samples_by_event(segment, event_steps, step, position_m, slice(0, 2), *more_columns)
+    position_m = (vision.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m)[
+        :, :2
+    ]
+    more_columns = (
+        measured_at_s[is_usable],
+        time_s[step_index],
+        *vision.variance_m2[is_usable, :2].T,
+    )
+    return samples_by_event(
+        segment, event_steps, step_index, position_m, slice(0, 2), *more_columns
+    )
 
 
 class VisionFilter:
@@ -98,9 +108,9 @@ class VisionFilter:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measured_at_s, self.now_s = samples[2:5]
-        _, count, events, configuration_count = samples.shape
-        self.update_log = np.full((events, count, 7, configuration_count), np.nan)
-        self.position_reset_m = np.zeros((events, configuration_count, 2))
+        _, sample_count, event_count, configuration_count = samples.shape
+        self.update_log = np.full((event_count, sample_count, 7, configuration_count), np.nan)
+        self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
         # EKF2 fuses GNSS before vision in the same prediction step: samples of an interval's last
         # step are fused after GNSS, earlier samples before GNSS
@@ -176,44 +186,48 @@ class VisionFilter:
             (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
         is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
-        restarts = has_sample & (has_restarted | is_failing)
+        is_restarting = has_sample & (has_restarted | is_failing)
         is_fused = has_sample & ~is_outside_gate & ~has_restarted
-        reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
-        is_evaluated = has_sample & ~has_restarted | reset
+        is_position_reset = is_restarting & (
+            without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S))
+        )
+        is_evaluated = has_sample & ~has_restarted | is_position_reset
         # if EKF2 resets its position to a sample, it logs innovation 0 for this sample
         update_log = (
-            *np.where(reset, 0.0, nu.T),
+            *np.where(is_position_reset, 0.0, nu.T),
             *diagonal.T,
-            is_outside_gate & ~reset,
+            is_outside_gate & ~is_position_reset,
             is_fused,
-            reset,
+            is_position_reset,
         )
         self.update_log[e, slot] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x = x + (K @ nu[:, :, None])[:, :, 0]
         P = P - K @ HP
-        if reset.any():
-            position_reset_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
-            variance = np.where(without_gnss[:, None], noise_m2, R)
+        if is_position_reset.any():
+            position_reset_m = (
+                np.where(without_gnss[:, None], distance_m, nu) * is_position_reset[:, None]
+            )
+            restart_variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(
                 x,
                 P,
-                reset,
+                is_position_reset,
                 HORIZONTAL_POSITION,
                 x[:, HORIZONTAL_POSITION] + position_reset_m,
-                variance,
+                restart_variance,
             )
             self.position_reset_m[e] += position_reset_m
-        if restarts.any():
-            new_bias = (restarts & ~reset)[:, None]
-            no_bias = (reset & without_gnss)[:, None]
+        if is_restarting.any():
+            new_bias = (is_restarting & ~is_position_reset)[:, None]
+            no_bias = (is_position_reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )
             self.bias.variance_m2 = np.where(no_bias, 0.0, self.bias.variance_m2)
         self.last_sample_s = np.where(has_sample, now_s, self.last_sample_s)
-        self.last_attempt_s = np.where(is_fused | restarts, now_s, self.last_attempt_s)
-        self.fused_s = np.where(is_fused | reset, now_s, self.fused_s)
+        self.last_attempt_s = np.where(is_fused | is_restarting, now_s, self.last_attempt_s)
+        self.fused_s = np.where(is_fused | is_position_reset, now_s, self.fused_s)
         self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
         return x, P
 

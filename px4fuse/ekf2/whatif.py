@@ -35,7 +35,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 what-if"
-# The logged time between fusions is known if the log has this fraction of the replayed innovations
+# Minimum fraction of the replayed innovations in the log for a logged time between fusions
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -62,19 +62,18 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Take the height from the log (vehicle_local_position).",
 )
-# Minimum evaluated time (s) after an aiding source is disabled
+# Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m) that is added in repeated replays, to test if the statistics depend on the
-# rejection of single samples
+# Position noise (m) that is added in repeated replays
 ADDED_NOISE_M = 0.002
-# Number of repeated replays
+# Number of repeated replays with added position noise
 ADDED_NOISE_RUNS = 4
-# Replays with a larger rejected fraction are repeated
+# Minimum rejected fraction of a replay that is repeated with added position noise
 MIN_REJECTED_FRACTION = 0.02
-# The statistics of a replay with a larger rejected fraction are not predictable
+# Maximum rejected fraction of a replay with predictable statistics
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
@@ -238,7 +237,7 @@ def what_if(
                 f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
                 "earlier time."
             )
-    gnss = model.inputs.aid == GNSS_POS
+    is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.flown, evaluated_s),
@@ -251,7 +250,7 @@ def what_if(
         ),
         evaluated_s=evaluated_s,
         notes=(
-            *(_heading_and_height_notes(model) if replays and gnss else ()),
+            *(_heading_and_height_notes(model) if replays and is_gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
             *(
                 _deviation_note(model, replay, without, evaluated_s)
@@ -309,10 +308,10 @@ def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
     """Set ``is_predictable`` to False where added position noise changes the statistics."""
-    runs = [[summary] for summary in summaries]
+    repeated_summaries = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
-        for repeated_runs in runs
+        for repeated_runs in repeated_summaries
         if repeated_runs[0].changed
         and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
@@ -323,7 +322,7 @@ def _mark_unpredictable(
         for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
             repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     marked_summaries = []
-    for summary, *noisy_summaries in runs:
+    for summary, *noisy_summaries in repeated_summaries:
         rejected_fractions = [
             axis_summary.rejected_fraction for axis_summary in summary.others.values()
         ]
@@ -338,17 +337,19 @@ def _mark_unpredictable(
     return tuple(marked_summaries)
 
 
-def _results_agree(runs: Sequence[Summary]) -> bool:
+def _results_agree(summaries: Sequence[Summary]) -> bool:
     """Return True if repeated replays have nearly the same statistics."""
-    rmse = [
-        error for summary in runs if isinstance(error := summary.position_rmse_to_truth_m, float)
+    rmse_values = [
+        error
+        for summary in summaries
+        if isinstance(error := summary.position_rmse_to_truth_m, float)
     ]
-    rejected_fractions = [summary.rejected_fraction for summary in runs]
-    nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
+    rejected_fractions = [summary.rejected_fraction for summary in summaries]
+    nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
     return (
-        all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis)
+        all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
-        and (not rmse or max(rmse) <= MAX_RMSE_RATIO * min(rmse))
+        and (not rmse_values or max(rmse_values) <= MAX_RMSE_RATIO * min(rmse_values))
     )
 
 
@@ -373,9 +374,9 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
     fused_s = evaluated_updates["fused_at_s"][
         (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
     ]
-    resets = evaluated_updates["reset"].sum()
+    reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
-        resets += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
+        reset_count += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
     return _make_summary(
         flight,
         replay,
@@ -387,7 +388,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         replay.delayed["heading_rad"],
         changed=replay.changed,
         longest_without_fusion_s=_longest_between_fusions(fused_s.to_numpy(), evaluated_s),
-        resets=int(resets),
+        resets=int(reset_count),
         late=replay.late,
         lost=replay.lost,
         velocity_rejected_fraction=_mean_rejected(
@@ -402,17 +403,19 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     logged_updates = logged_innovations(ekf2)
     evaluated_updates = logged_updates[inside_spans(logged_updates.index, evaluated_s)]
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
-    resets = horizontal_resets_s(ekf2) - horizon_s
-    resets = resets[inside_spans(resets, evaluated_s)]
-    replayed = int(inside_spans(replay.updates.index, evaluated_s).sum())
+    reset_times_s = horizontal_resets_s(ekf2) - horizon_s
+    reset_times_s = reset_times_s[inside_spans(reset_times_s, evaluated_s)]
+    replayed_count = int(inside_spans(replay.updates.index, evaluated_s).sum())
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
-        f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
+        f"the log contains only {len(evaluated_updates)} of about {replayed_count} innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
-    if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed:
+    if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed_count:
         fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
-        longest_gap_s = _longest_between_fusions(np.concatenate([fused_s, resets]), evaluated_s)
+        longest_gap_s = _longest_between_fusions(
+            np.concatenate([fused_s, reset_times_s]), evaluated_s
+        )
     # a flight with a replay has an attitude
     assert isinstance(flight.attitude, pd.DataFrame)
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
@@ -430,7 +433,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         heading,
         changed={},
         longest_without_fusion_s=longest_gap_s,
-        resets=len(resets),
+        resets=len(reset_times_s),
         velocity_rejected_fraction=(
             _mean_rejected(ekf2.aids[GNSS_VEL.name].samples, "rejected", evaluated_s)
             if "velocity_rejected" in replay.updates and GNSS_VEL.name in ekf2.aids
@@ -463,12 +466,14 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged_variance = ekf2.variance
-    times = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
+    evaluated_state_s = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
-        position = component_along(published_track, Columns.POSITION, direction, times)
-        error = rms_to_truth(flight, position, direction, times)
-        return NO_TRUTH if error is None else error
+        position_m = component_along(
+            published_track, Columns.POSITION, direction, evaluated_state_s
+        )
+        rmse_to_truth = rms_to_truth(flight, position_m, direction, evaluated_state_s)
+        return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
     for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
         sigma: float | Unavailable
@@ -478,8 +483,10 @@ def _make_summary(
             variance_s = logged_variance.index[
                 inside_spans(logged_variance.index, evaluated_s)
             ].to_numpy()
-            series = (logged_variance if variance is None else variance)[f"{axis}_m2"]
-            sigma = float(np.sqrt(np.median(np.interp(variance_s, series.index, series))))
+            axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
+            sigma = float(
+                np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
+            )
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
@@ -536,40 +543,44 @@ def _heading_error(
     true_heading = np.interp(
         heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
-    error = np.angle(np.exp(1j * (heading.to_numpy() - true_heading)))
-    return float(np.degrees(np.nanmean(error)))
+    error_rad = np.angle(np.exp(1j * (heading.to_numpy() - true_heading)))
+    return float(np.degrees(np.nanmean(error_rad)))
 
 
 def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
-    ends = [evaluated_s[0][0], evaluated_s[-1][1]]
-    return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
+    fusion_times_s = [evaluated_s[0][0], evaluated_s[-1][1]]
+    return float(np.max(np.diff(np.sort(np.concatenate([fused_s, fusion_times_s])))))
 
 
 def _deviation_note(
     model: Model, replay: Ekf2Replay, replays_without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
-    difference = replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
-    difference = difference[inside_spans(difference.index, evaluated_s)]
-    *horizontal_m, down = np.abs(difference.to_numpy()).T
-    distance = np.hypot(*horizontal_m)
+    position_difference_m = (
+        replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
+    )
+    position_difference_m = position_difference_m[
+        inside_spans(position_difference_m.index, evaluated_s)
+    ]
+    *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
+    horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
-    heights = {*model.flown.other_aid_updates} - {EV_POS.name}
-    horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
+    height_aids = {*model.flown.other_aid_updates} - {EV_POS.name}
+    horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     height_note = (
-        f". The published height differs by at most {down.max():.3g} m"
-        if heights & {*replays_without}
+        f". The published height differs by at most {down_difference_m.max():.3g} m"
+        if height_aids & {*replays_without}
         else ""
     )
     give_up_note = (
         ". The replay continues with the IMU alone; EKF2 stops publishing a position after "
         "EKF2_NOAID_TOUT (5 s)"
     )
-    at_s = difference.index[distance.argmax()]
+    at_s = position_difference_m.index[horizontal_distance_m.argmax()]
     return (
         f"Without {aids_text} the published position differs from the replay with all aiding "
-        f"sources by at most {distance.max():.3g} m (at {at_s:.1f} s), and by "
-        f"{distance[-1]:.3g} m at the end{height_note}"
+        f"sources by at most {horizontal_distance_m.max():.3g} m (at {at_s:.1f} s), and by "
+        f"{horizontal_distance_m[-1]:.3g} m at the end{height_note}"
         + (give_up_note if horizontal_aids <= replays_without.keys() else "")
     )
 
@@ -585,10 +596,10 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         remedy = "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
         # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
         # prediction step
-        samples = max(len(replay.updates), replay.late) + replay.lost
+        received_count = max(len(replay.updates), replay.late) + replay.lost
         yield (
-            f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "
-            f"arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
+            f"{_change_text(replay)}: {replay.late + replay.lost} of {received_count} samples "
+            f"would arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
         )
 
 

@@ -25,7 +25,7 @@ from px4fuse.findings import Finding
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 # Pairs of quiz answers whose injected faults do not hide each other in one flight
@@ -187,7 +187,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
         for mistake, size in mistakes_and_sizes
         if mistake.mistake != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # as_sent: an automatic correction of the frame would hide the injected fault

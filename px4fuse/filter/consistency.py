@@ -112,14 +112,17 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
     (1.67, 2.36)
     """
     # half of the sum of all NIS has a gamma distribution with this shape parameter
-    shape = 0.5 * count * dimensions
+    gamma_shape = 0.5 * count * dimensions
     low, high = (
-        float(gammaincinv(shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / shape for sign in (-1, 1)
+        float(gammaincinv(gamma_shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / gamma_shape
+        for sign in (-1, 1)
     )
     return low, high
 
 
-def classify_ratio(ratio: float, reference: Reference, interval: Interval | None = None) -> Verdict:
+def classify_sigma_ratio(
+    ratio: float, reference: Reference, interval: Interval | None = None
+) -> Verdict:
     """Return the verdict on a ratio of actual to reported σ.
 
     The filter is consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % ``interval`` of the
@@ -131,35 +134,35 @@ def classify_ratio(ratio: float, reference: Reference, interval: Interval | None
     return "overconfident" if ratio > 1.0 else "underconfident"
 
 
-def ratio_interval(nis_mean: float, band: Interval) -> Interval:
+def sigma_ratio_interval(nis_mean: float, band: Interval) -> Interval:
     """Return the 95 % interval of √(mean NIS)."""
     return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
 
 
 def classify_mean_nis(nis_mean: float, band: Interval) -> Verdict:
-    return classify_ratio(nis_mean**0.5, "source", ratio_interval(nis_mean, band))
+    return classify_sigma_ratio(nis_mean**0.5, "source", sigma_ratio_interval(nis_mean, band))
 
 
-def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
-    mean = float(np.mean(nis)) / dimensions
-    band = nis_band(len(nis), dimensions)
+def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
+    nis_mean = float(np.mean(nis)) / dimensions
+    mean_nis_band = nis_band(len(nis), dimensions)
     return {
         "count": len(nis),
-        "nis_mean": mean,
-        "nis_band": band,
-        "sigma_ratio": float(np.sqrt(mean)),
-        "verdict": classify_mean_nis(mean, band),
+        "nis_mean": nis_mean,
+        "nis_band": mean_nis_band,
+        "sigma_ratio": float(np.sqrt(nis_mean)),
+        "verdict": classify_mean_nis(nis_mean, mean_nis_band),
     }
 
 
-def autocorrelation(values: Array, lags: int) -> Array:
-    """Return the autocorrelation of a series at lags 1 to ``lags``: Σ ν(k) ν(k+l) / Σ ν(k)².
+def autocorrelation(values: Array, lag_count: int) -> Array:
+    """Return the autocorrelation of a series at lags 1 to ``lag_count``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
     The mean is not subtracted, because ``bias_p`` tests the mean separately.
     """
     square_sum = float(np.dot(values, values))
     return np.array(
-        [np.dot(values[:-lag], values[lag:]) / square_sum for lag in range(1, lags + 1)]
+        [np.dot(values[:-lag], values[lag:]) / square_sum for lag in range(1, lag_count + 1)]
     )
 
 
@@ -173,12 +176,12 @@ def assess(
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu_m = innovation_m[is_usable]
     variance_m2 = innovation_variance_m2[is_usable]
-    count = len(nu_m)
-    if count < MIN_INNOVATIONS:
+    innovation_count = len(nu_m)
+    if innovation_count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
-            f"the filter has only {count_noun(count, 'innovation')} (at least {MIN_INNOVATIONS} "
-            "are needed)",
+            f"the filter has only {count_noun(innovation_count, 'innovation')} "
+            f"(at least {MIN_INNOVATIONS} are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     if np.ptp(nu_m) == 0.0:
@@ -189,22 +192,24 @@ def assess(
         )
     normalised = nu_m / np.sqrt(variance_m2)
     std_m = float(np.std(nu_m, ddof=1))
-    bias_t = float(np.sqrt(count) * np.mean(nu_m) / std_m)
-    lags = min(LJUNG_BOX_LAGS, count // 5)
-    correlations = autocorrelation(normalised, lags)
-    q_terms = correlations**2 / (count - np.arange(1, lags + 1))
+    bias_t = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
+    lag_count = min(LJUNG_BOX_LAGS, innovation_count // 5)
+    autocorrelations = autocorrelation(normalised, lag_count)
+    q_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
     return Consistency(
-        **_verdict_fields(normalised**2),
+        **_nis_verdict_fields(normalised**2),
         innovation_mean_m=float(np.mean(nu_m)),
         innovation_std_m=std_m,
         sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
         fraction_outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         fraction_outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
-        bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
-        lag1_autocorrelation=float(correlations[0]),
-        ljung_box_p=float(chdtrc(lags, count * (count + 2) * q_terms.sum())),
-        ljung_box_lags=lags,
+        bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(bias_t))),
+        lag1_autocorrelation=float(autocorrelations[0]),
+        ljung_box_p=float(
+            chdtrc(lag_count, innovation_count * (innovation_count + 2) * q_terms.sum())
+        ),
+        ljung_box_lags=lag_count,
     )
 
 
@@ -218,4 +223,4 @@ def assess_horizontal(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None
     nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)
     if len(nis) < MIN_INNOVATIONS or not nis.any():
         return None
-    return HorizontalNis(**_verdict_fields(nis, 2))
+    return HorizontalNis(**_nis_verdict_fields(nis, 2))

@@ -31,9 +31,9 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Maximum number of positions in the fits; of a longer flight only the middle is used
+# Maximum number of positions in a noise fit; of a longer flight only the middle is used
 MAX_MEASUREMENTS = 2000
-# Positions are not correlated over an interval longer than this multiple of the median interval
+# Maximum interval, as multiple of the median, over which positions are correlated
 MAX_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
@@ -41,15 +41,15 @@ COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
 COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Factors on SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Factors by which all noises are multiplied together in the coarse search
+# Common factors on all noises in the coarse search for time-correlated noise
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
 # Minimum gain of log-likelihood over white noise in the coarse search, before a full fit
 MIN_COARSE_GAIN_NATS = 0.5
-# Positions with a SIGMA_Z (m) below this limit are probably low-pass filtered
+# Maximum SIGMA_Z (m) of positions that are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
-# Minimum gain of log-likelihood over white noise in the full fit
+# Minimum gain of log-likelihood over white noise in the full fit of time-correlated noise
 MIN_GAIN_NATS = 2.0
 # Penalty (nats) for shifted timestamps: 1 for each of two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
@@ -59,7 +59,7 @@ LOW_PASS_TAU_S = (0.02, 3.0)
 LOG_TAU_TOLERANCE = 0.05
 # Maximum number of position errors against ground truth in the fit, which limits its time
 MAX_TRUTH_MEASUREMENTS = 300
-# Minimum gain of log-likelihood over white noise in the fit to ground truth
+# Minimum gain of log-likelihood over white noise in the noise fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
 # Maximum time (s) between a measurement and the nearest ground truth: error of 1 cm at 2 m/s²
 MAX_TRUTH_DISTANCE_S = 0.1
@@ -105,7 +105,7 @@ class TimeCorrelatedNoise:
         Standard deviations of time-correlated and white noise, per axis.
     gain_nats : float
         Gain of log-likelihood over white noise alone.
-    lag_nats : float
+    low_pass_gain_nats : float
         Log-likelihood of a low pass minus that of time-correlated noise.
     """
 
@@ -115,7 +115,7 @@ class TimeCorrelatedNoise:
     slow_m: float
     white_m: float
     gain_nats: float
-    lag_nats: float
+    low_pass_gain_nats: float
 
 
 def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
@@ -151,9 +151,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             "time correlation of the position errors", len(time_s), MIN_MEASUREMENTS
         )
     first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
-    rows = slice(first_row, first_row + MAX_MEASUREMENTS)
-    time_s = time_s[rows]
-    measured_m = np.column_stack([axis.measurement_m[rows] for axis in axes])
+    middle_rows = slice(first_row, first_row + MAX_MEASUREMENTS)
+    time_s = time_s[middle_rows]
+    measured_m = np.column_stack([axis.measurement_m[middle_rows] for axis in axes])
     for jump in jumps:
         measured_m = measured_m - np.outer(
             time_s >= jump.time_s, [step.value for step in jump.step_m]
@@ -164,7 +164,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         interval_s > 0.0
     )
     directions = np.array([axis.direction for axis in axes])
-    signals = SignalCache()
+    signal_cache = SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
         """Return the positions before the low pass, and -ln of the Jacobian of the inverse."""
@@ -181,7 +181,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             unfiltered_m[is_used_position],
             directions=directions,
             dt_s=settings.dt_s,
-            signals=signals,
+            signal_cache=signal_cache,
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
@@ -193,7 +193,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     prepared_motion, _ = undo_low_pass(0.0)
     if isinstance(prepared_motion, Unavailable):
         return prepared_motion
-    offsets = sorted({0.0, clock_offset_s})
+    tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noises.sigma_z_m
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
@@ -207,7 +207,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         for fraction, tau in product(COARSE_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
     (white_score, _), (correlated_score, correlated_start) = (
-        _best_of_grid(coarse_motion, offsets, candidate_noises)
+        _best_of_grid(coarse_motion, tested_offsets_s, candidate_noises)
         for candidate_noises in ([noises], correlated_noises)
     )
     no_correlation = Unavailable(
@@ -218,7 +218,10 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         return low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
-            ((_fit_noises_at(prepared_motion, offset, start_noises), offset) for offset in offsets),
+            (
+                (_fit_noises_at(prepared_motion, offset, start_noises), offset)
+                for offset in tested_offsets_s
+            ),
             key=lambda fit_and_offset: fit_and_offset[0].lowest_score,
         )
         for start_noises in (noises, correlated_start)
@@ -235,22 +238,22 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
         # prepare_motion succeeded for the white-noise model with the same measurements
         assert not isinstance(prepared_motion, Unavailable)
-        fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
-        return fit.lowest_score + jacobian_term, fit.noises
+        noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
+        return noise_fit.lowest_score + jacobian_term, noise_fit.noises
 
-    low, high = np.log(LOW_PASS_TAU_S)
+    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
-        bounds=(low, high),
+        bounds=(low_log_tau, high_log_tau),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    score, filtered_noises = fit_low_pass(log_tau)
-    if score < white_full_score:
+    low_pass_score, filtered_noises = fit_low_pass(log_tau)
+    if low_pass_score < white_full_score:
         median_s = float(np.median(np.diff(time_s)))
-        correlation = float(np.exp(-median_s / np.exp(log_tau)))
-        lag_s = median_s * correlation / (1.0 - correlation)
+        lag1_correlation = float(np.exp(-median_s / np.exp(log_tau)))
+        lag_s = median_s * lag1_correlation / (1.0 - lag1_correlation)
         low_pass = SourceLowPass(
-            correlation, lag_s, white_full_score - score, filtered_noises.sigma_z_m
+            lag1_correlation, lag_s, white_full_score - low_pass_score, filtered_noises.sigma_z_m
         )
     if not is_correlated:
         return low_pass, no_correlation
@@ -262,7 +265,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         fitted_noises.correlated_sigma_m,
         fitted_noises.sigma_z_m,
         white_full_score - correlated_score,
-        correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
+        correlated_score - low_pass_score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
 
 
@@ -282,66 +285,90 @@ def fit_time_correlation_to_truth(
     gain.
     """
     min_gain = MIN_TRUTH_GAIN_NATS
-    lag_nats = low_pass.gain_nats
+    low_pass_gain_nats = low_pass.gain_nats
     if isinstance(imu_fit, TimeCorrelatedNoise):
         min_gain = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
-        lag_nats = imu_fit.lag_nats
+        low_pass_gain_nats = imu_fit.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
-    time = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
-    time = time[
-        true_track.index.get_indexer(pd.Index(time), "nearest", tolerance=MAX_TRUTH_DISTANCE_S) >= 0
+    measured_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
+    measured_s = measured_s[
+        true_track.index.get_indexer(
+            pd.Index(measured_s), "nearest", tolerance=MAX_TRUTH_DISTANCE_S
+        )
+        >= 0
     ]
-    time = time[:: max(1, -(-len(time) // MAX_TRUTH_MEASUREMENTS))]
-    if len(time) < MIN_MEASUREMENTS:
+    measured_s = measured_s[:: max(1, -(-len(measured_s) // MAX_TRUTH_MEASUREMENTS))]
+    if len(measured_s) < MIN_MEASUREMENTS:
         return imu_fit
     measured_m = np.transpose(
-        [axis.measurement_m[np.isin(axis.measurement_time_s, time)] for axis in axes]
+        [axis.measurement_m[np.isin(axis.measurement_time_s, measured_s)] for axis in axes]
     )
-    track = CubicSpline(true_track.index, true_track)
-    true_m, velocity = (track(time + clock_offset_s, order) for order in (0, 1))
+    true_spline = CubicSpline(true_track.index, true_track)
+    true_m, true_velocity_m_s = (
+        true_spline(measured_s + clock_offset_s, order) for order in (0, 1)
+    )
     part_indicators = np.eye(OFFSET_PART_COUNT)[
-        OFFSET_PART_COUNT * np.arange(len(time)) // len(time)
+        OFFSET_PART_COUNT * np.arange(len(measured_s)) // len(measured_s)
     ]
-    offset_columns = np.einsum("tp,ta->tpa", part_indicators, velocity).reshape(len(time), -1)
-    jump_columns = unit_steps(time, [jump.time_s for jump in jumps])
-    nuisance_columns = np.column_stack([np.ones_like(time), true_m, offset_columns, jump_columns])
+    offset_columns = np.einsum("tp,ta->tpa", part_indicators, true_velocity_m_s).reshape(
+        len(measured_s), -1
+    )
+    jump_columns = unit_steps(measured_s, [jump.time_s for jump in jumps])
+    nuisance_columns = np.column_stack(
+        [np.ones_like(measured_s), true_m, offset_columns, jump_columns]
+    )
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
-    fractions = CORRELATED_FRACTIONS
+    correlated_fractions = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
-    for tau in TRUTH_TAUS_S:
-        correlation = (
-            residual_basis.T @ np.exp(-np.abs(time[:, None] - time) / tau) @ residual_basis
+    for tau_candidate_s in TRUTH_TAUS_S:
+        correlation_matrix = (
+            residual_basis.T
+            @ np.exp(-np.abs(measured_s[:, None] - measured_s) / tau_candidate_s)
+            @ residual_basis
         )
-        eigenvalues, eigenvectors = np.linalg.eigh(correlation)
-        variance = 1.0 - fractions + fractions * eigenvalues[:, None]
-        mean_square = ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / variance) / len(residuals)
-        score = half_counts @ [np.log(variance).sum(axis=0), np.log(mean_square).sum(axis=0)]
-        grid_scores.append((score, mean_square.mean(axis=0)))
+        eigenvalues, eigenvectors = np.linalg.eigh(correlation_matrix)
+        relative_variance = 1.0 - correlated_fractions + correlated_fractions * eigenvalues[:, None]
+        mean_squares = (
+            ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
+        )
+        scores = half_counts @ [
+            np.log(relative_variance).sum(axis=0),
+            np.log(mean_squares).sum(axis=0),
+        ]
+        grid_scores.append((scores, mean_squares.mean(axis=0)))
     # both have the shape (time constants, correlated fractions)
-    score, mean_square = np.transpose(grid_scores, (1, 0, 2))
-    tau_index, fraction_index = divmod(int(np.argmin(score)), len(fractions))
-    gain = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - score.min(axis=1)
-    if gain.max() < min_gain:
+    scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
+    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(correlated_fractions))
+    gains_nats = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - scores.min(axis=1)
+    if gains_nats.max() < min_gain:
         return imu_fit
-    first_tau, last_tau = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
+    first_tau_index, last_tau_index = np.flatnonzero(gains_nats > gains_nats.max() - PROFILE_DROP)[
+        [0, -1]
+    ]
     # the 95 % interval ends between grid points, so the next outer grid points are returned
-    tau_s = np.append(TRUTH_TAUS_S, np.inf)[[tau_index, max(first_tau - 1, 0), last_tau + 1]]
+    tau_s = np.append(TRUTH_TAUS_S, np.inf)[
+        [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
+    ]
     sigmas_m = np.sqrt(
-        mean_square[tau_index, fraction_index]
-        * np.array([fractions[fraction_index], 1.0 - fractions[fraction_index]])
+        mean_squares[tau_index, fraction_index]
+        * np.array(
+            [correlated_fractions[fraction_index], 1.0 - correlated_fractions[fraction_index]]
+        )
     )
-    return TimeCorrelatedNoise(*np.r_[tau_s, sigmas_m, gain.max(), lag_nats].tolist())
+    return TimeCorrelatedNoise(
+        *np.r_[tau_s, sigmas_m, gains_nats.max(), low_pass_gain_nats].tolist()
+    )
 
 
 def _fit_noises_at(
     prepared_motion: PreparedMotion, offset_s: float, start_noises: Noises
 ) -> NoiseFit:
     return maximise_likelihood(
-        [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight, outliers=False
+        [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight, fits_outliers=False
     )
 
 
@@ -349,16 +376,22 @@ def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
     """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
-    results = []
+    scored_noises = []
     for positions in map(prepared_motion.at, offsets_s):
-        for candidate, factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
-            noises = replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
-            totals = fit_noises([positions], noises, prepared_motion.weight).scores(
+        for noises_candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
+            noises = replace(
+                noises_candidate, sigma_a_m_s2=sigma_a_factor * noises_candidate.sigma_a_m_s2
+            )
+            total_scores = fit_noises([positions], noises, prepared_motion.weight).scores(
                 COARSE_NOISE_FACTORS
             )[:, 0]
-            results.append(
-                (float(totals.min()), float(COARSE_NOISE_FACTORS[np.argmin(totals)]), noises)
+            scored_noises.append(
+                (
+                    float(total_scores.min()),
+                    float(COARSE_NOISE_FACTORS[np.argmin(total_scores)]),
+                    noises,
+                )
             )
-    lowest_score, scale, noises = min(results, key=lambda result: result[0])
+    lowest_score, scale, noises = min(scored_noises, key=lambda result: result[0])
     scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
     return lowest_score, replace(noises, **scaled_values)

@@ -44,17 +44,17 @@ START_OUTLIER_FRACTION = 0.005
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# While outliers are estimated, SIGMA_Z exceeds its robust estimate (median) at most by this factor
+# Maximum ratio of SIGMA_Z to its robust estimate (median) while outliers are estimated
 MAX_SIGMA_Z_RATIO = 1.2
-# Expectation maximisation has converged if no outlier probability changes by more than this
+# Maximum change of an outlier probability after convergence of the expectation maximisation
 MAX_PROBABILITY_CHANGE = 0.01
-# Replaces -ln p per measurement if it cannot be computed; larger than any computed value
+# Value of -ln p per measurement if the likelihood cannot be computed: larger than any other
 UNCOMPUTABLE_SCORE = 1e6
-# Step of ln σ for numerical derivatives of the likelihood
+# Step of ln σ for numerical derivatives of the log-likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number of nodes for interpolation of the likelihood, and distance of the nodes in ln σ
+# Number of nodes for interpolation of the final likelihood, and distance of the nodes in ln σ
 LIKELIHOOD_NODES = 10, 0.25
-# The same, while the outlier probabilities still change and a coarse maximum is sufficient
+# Number and distance (ln σ) of the nodes while the outlier probabilities still change
 COARSE_LIKELIHOOD_NODES = 6, 0.2
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
@@ -161,20 +161,20 @@ class Likelihood:
 
 
 @cache
-def _barycentric_signs(count: int) -> Array:
-    nodes = np.arange(count)
-    return np.asarray((-1.0) ** nodes * comb(count - 1, nodes))
+def _barycentric_signs(node_count: int) -> Array:
+    nodes = np.arange(node_count)
+    return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
 
 
-def _interpolation_weights(position: float, count: int) -> Array:
+def _interpolation_weights(position: float, node_count: int) -> Array:
     """Return the weights of the values at 0, 1, ... for barycentric interpolation at a position.
 
     Berrut and Trefethen (2004).
     """
-    distances = position - np.arange(count)
-    if not distances.all():
-        return np.asarray(distances == 0.0, dtype=np.float64)
-    weights = _barycentric_signs(count) / distances
+    node_distances = position - np.arange(node_count)
+    if not node_distances.all():
+        return np.asarray(node_distances == 0.0, dtype=np.float64)
+    weights = _barycentric_signs(node_count) / node_distances
     return np.asarray(weights / weights.sum())
 
 
@@ -209,15 +209,17 @@ def fit_noises(
     position_batches: Iterable[Positions], noises: Noises, weight: Array
 ) -> FittedPositions:
     """Fit positions with one set of noises; the variance of a measurement is SIGMA_Z² / weight."""
-    sigma = noises.sigma_z_m
+    sigma_z_m = noises.sigma_z_m
     if noises.correlated_sigma_m:
         position_batches = (
             replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
             for positions in position_batches
         )
-    ratio = noises.sigma_a_m_s2 / sigma
-    (fit,) = fit_ratios(position_batches, [ratio], noises.random_walk_m / sigma, weight, sigma)
-    return fit.scaled(sigma)
+    sigma_ratio = noises.sigma_a_m_s2 / sigma_z_m
+    (fit,) = fit_ratios(
+        position_batches, [sigma_ratio], noises.random_walk_m / sigma_z_m, weight, sigma_z_m
+    )
+    return fit.scaled(sigma_z_m)
 
 
 def negative_log_likelihood(
@@ -258,11 +260,11 @@ class NoiseFit:
 
 def filter_positions(intervals: Preintegrated) -> Positions:
     """Convert the input of KF to positions; the error of the initial state is unknown."""
-    count = len(intervals.measurement_m)
-    prior_precision = np.zeros((count + 1, 2))
+    measurement_count = len(intervals.measurement_m)
+    prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
     measured_m = np.append(np.nan, intervals.measurement_m - intervals.initial.position_m)[:, None]
-    dp, dv = np.zeros((2, 1, 1, 3, count))
+    dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = intervals.delta_position_m
     dv[0, 0, 0] = intervals.delta_velocity_m_s
     # an initial position or velocity error changes only the first increment
@@ -284,9 +286,9 @@ def filter_positions(intervals: Preintegrated) -> Positions:
 
 
 def maximise_likelihood(
-    axis_positions: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
+    axis_positions: Sequence[Positions], start: Noises, weight: Array, fits_outliers: bool = True
 ) -> NoiseFit:
-    """Estimate the noises and, if ``outliers`` is True, the outliers by maximum likelihood.
+    """Estimate the noises and, if ``fits_outliers`` is True, the outliers by maximum likelihood.
 
     Parameters
     ----------
@@ -296,47 +298,61 @@ def maximise_likelihood(
         Initial values. Random walk and time-correlated noise are only fitted if not zero.
     weight : ndarray, shape (m,)
         Initial weight of each measurement.
-    outliers : bool
+    fits_outliers : bool
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
     outlier_share = START_OUTLIER_FRACTION
     outlier_width = START_OUTLIER_WIDTH
     noises = start
-    for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
+    for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
             likelihood, noises, COARSE_MAX_ITERATIONS if iteration else MAX_ITERATIONS
         )
-        squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
         # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
         # the median
-        median_square = float(np.median(squares / count) / (chdtri(count[0], 0.5) / count[0]))
+        median_square = float(
+            np.median(expected_squares_m2 / axis_counts)
+            / (chdtri(axis_counts[0], 0.5) / axis_counts[0])
+        )
         # if the median error is above the search range, large errors are noise, not outliers
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
-        variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        probability = _outlier_probability(squares / variance, count, outlier_share, outlier_width)
-        if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
+        sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
+        new_probability = _outlier_probability(
+            expected_squares_m2 / sigma_z_variance_m2, axis_counts, outlier_share, outlier_width
+        )
+        if (
+            new_probability.sum() < 1.0
+            and new_probability.max() < 0.5
+            and not outlier_probability.any()
+        ):
             break
         outlier_share = float(
-            np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_FRACTION)
+            np.clip(new_probability.mean(), 0.5 / len(new_probability), MAX_OUTLIER_FRACTION)
         )
-        outlier_square = np.sum(probability * squares) / max(np.sum(probability * count), 1e-9)
-        outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
-        weight = 1.0 - probability * (1.0 - outlier_width**-2.0)
-        change = np.abs(probability - outlier_probability)
-        outlier_probability = probability
-        if change.max() < MAX_PROBABILITY_CHANGE:
+        outlier_square = np.sum(new_probability * expected_squares_m2) / max(
+            np.sum(new_probability * axis_counts), 1e-9
+        )
+        outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / sigma_z_variance_m2)))
+        weight = 1.0 - new_probability * (1.0 - outlier_width**-2.0)
+        probability_change = np.abs(new_probability - outlier_probability)
+        outlier_probability = new_probability
+        if probability_change.max() < MAX_PROBABILITY_CHANGE:
             break
-        noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
+        noises = replace(noises, sigma_z_m=float(np.sqrt(sigma_z_variance_m2)))
     likelihood = Likelihood(axis_positions, weight, start.sigma_z_m)
     noises = _maximise_by_gradient(likelihood, noises)
     sigma_z_variance_factor = 1.0
     if outlier_probability.any():
-        squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
         sigma_z_variance_factor = outlier_variance_factor(
-            squares / noises.sigma_z_m**2, count, outlier_probability, outlier_width
+            expected_squares_m2 / noises.sigma_z_m**2,
+            axis_counts,
+            outlier_probability,
+            outlier_width,
         )
     return NoiseFit(noises, weight, outlier_probability, likelihood, sigma_z_variance_factor)
 
@@ -345,45 +361,47 @@ def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
     """Return the expected squared error (m²) and the number of axes of each measurement."""
-    results = []
+    squares_and_counts = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
-        scaled_positions, variance = positions.in_sigma_z_units(
+        scaled_positions, scaled_variance = positions.in_sigma_z_units(
             1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
         )
-        results.append(expected_squares(scaled_positions, noises.sigma_a_m_s2, variance, constants))
-    squares, axis_counts = np.sum(results, axis=0)[:, -len(weight) :]
-    return squares, axis_counts
+        squares_and_counts.append(
+            expected_squares(scaled_positions, noises.sigma_a_m_s2, scaled_variance, constants)
+        )
+    squares_m2, axis_counts = np.sum(squares_and_counts, axis=0)[:, -len(weight) :]
+    return squares_m2, axis_counts
 
 
 def _outlier_probability(
-    expected_squares: Array, count: Array, outlier_share: float, outlier_width: float
+    expected_squares: Array, axis_counts: Array, outlier_share: float, outlier_width: float
 ) -> Array:
-    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(outlier_width)
+    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - axis_counts * np.log(outlier_width)
     return np.asarray(expit(log_odds + 0.5 * expected_squares * (1.0 - outlier_width**-2.0)))
 
 
 def outlier_variance_factor(
-    square: Array, count: Array, outlier_probability: Array, outlier_width: float
+    normalised_squares: Array, axis_counts: Array, outlier_probability: Array, outlier_width: float
 ) -> float:
     """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
 
     Observed information = complete information - missing information (Louis 1982), for the
-    parameters ln σ, ln width and the log odds of an outlier. ``square`` is the squared error of
-    each measurement / σ², summed over its ``count`` axes.
+    parameters ln σ, ln width and the log odds of an outlier. ``normalised_squares`` is the squared
+    error of each measurement / σ², summed over its ``axis_counts`` axes.
     """
     outlier_share = np.mean(outlier_probability)
-    sigma_information = 2.0 * float(np.sum(count))
+    sigma_information = 2.0 * float(np.sum(axis_counts))
     inverse_square_width = outlier_width**-2.0
     complete_information = np.zeros((3, 3))
-    complete_information[:2, :2] = 2.0 * np.sum(count * outlier_probability)
+    complete_information[:2, :2] = 2.0 * np.sum(axis_counts * outlier_probability)
     complete_information[0, 0] = sigma_information
-    complete_information[2, 2] = len(square) * outlier_share * (1.0 - outlier_share)
+    complete_information[2, 2] = len(normalised_squares) * outlier_share * (1.0 - outlier_share)
     scores = np.stack(
         [
-            square * (inverse_square_width - 1.0),
-            square * inverse_square_width - count,
-            np.ones_like(square),
+            normalised_squares * (inverse_square_width - 1.0),
+            normalised_squares * inverse_square_width - axis_counts,
+            np.ones_like(normalised_squares),
         ]
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T

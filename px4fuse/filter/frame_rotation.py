@@ -31,21 +31,21 @@ from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# Length (s) of the parts of the flight if the source measures an orientation
+# Length (s) of each flight part whose heading error is estimated from orientations
 PART_LENGTH_S = 2.0
-# Length (s) of the parts of the flight if the source measures no orientation
-POSITION_PART_LENGTH_S = 15.0
-# Minimum length (s) of a part of the flight for an estimate from positions
+# Length (s) of each flight part whose heading error is estimated from positions
+POSITION_PART_S = 15.0
+# Minimum length (s) of a flight part whose heading error is estimated from positions
 MIN_POSITION_PART_S = 5.0
-# Minimum number of parts for a comparison of orientations
+# Minimum number of flight parts for a heading error from orientations
 MIN_PARTS = 3
-# Minimum number of positions for an estimate from positions
+# Minimum number of positions for an estimate of the heading error
 MIN_MEASUREMENTS = 50
-# Minimum number of orientation samples in a part of the flight
+# Minimum number of orientation samples in a flight part
 MIN_PART_SAMPLES = 3
-# Maximum number of positions; longer tracks are downsampled, as more hardly improve the heading
+# Maximum number of positions for the heading error; longer tracks are downsampled
 MAX_MEASUREMENTS = 1000
-# The heading error changes in flight if the p-value of "constant" is below this limit
+# Maximum p-value of a constant heading error for the result that it changes in flight
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_DRIFT_DEG = 5.5
@@ -55,16 +55,16 @@ MAX_YAW_RATE_DEG_S = 10.0
 MIN_SIGMA_DEG = 0.5
 # Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of iterations of the linearised fit
+# Maximum number of linearisations in the fit of the heading error
 MAX_LINEARISATIONS = 5
-# The linearised fit has converged if the heading error changes by less than this (rad)
+# Maximum change (rad) of the heading error in the last iteration of the linearised fit
 MAX_FINAL_STEP_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
-# Minimum estimated scale of the positions, which prevents a division by zero
+# Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_SCALE = 0.1
-# Index of the heading error among the unknown constants of a part of the flight
-HEADING_CONSTANT = 2
+# Index of the heading error among the unknown constants of a flight part
+HEADING_ERROR_INDEX = 2
 
 
 class HeadingPart(Record, frozen=True):
@@ -163,16 +163,22 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
         return Unavailable(
             "heading error", "the IMU rate is too low", "Log sensor_combined at full rate."
         )
-    samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna()
-    if len(samples) < MIN_MEASUREMENTS:
-        return too_few_measurements("heading error", len(samples), MIN_MEASUREMENTS)
-    samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
-    samples = samples.set_axis(samples.index.to_numpy() + offset_s)
+    position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna()
+    if len(position_samples) < MIN_MEASUREMENTS:
+        return too_few_measurements("heading error", len(position_samples), MIN_MEASUREMENTS)
+    position_samples = position_samples.iloc[
+        :: int(np.ceil(len(position_samples) / MAX_MEASUREMENTS))
+    ]
+    position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
     # the mounting angle of the source is unknown, so an orientation only shows if the misalignment
     # is constant
     return _estimate_from_positions(
-        flight, samples, noises, settings.dt_s, is_constant=orientation_result is not None
+        flight,
+        position_samples,
+        noises,
+        settings.dt_s,
+        has_constant_heading=orientation_result is not None,
     )
 
 
@@ -183,10 +189,10 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
     a mean is the RMS of the samples' σ.
     """
     # parts of a long, downsampled track may exceed PART_LENGTH_S, to contain enough samples
-    count = max(
+    part_count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
-    part_edges_s = np.linspace(time_s[0], time_s[-1], count + 1)[1:-1]
+    part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
     rows_of_parts = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
         HeadingPart(
@@ -208,13 +214,13 @@ def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
     """Compare the source's heading with EKF2's logged heading; None with too few samples."""
-    samples = cut_to_segment(orientation, segment)
-    time_s = samples.index.to_numpy() + offset_s
+    orientation_samples = cut_to_segment(orientation, segment)
+    time_s = orientation_samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
     is_covered = (time_s >= attitude_s[0]) & (time_s <= attitude_s[-1])
     if np.count_nonzero(is_covered) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    source_yaw_rad = heading_rad(samples)[is_covered]
+    source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
     yaw_rad = np.interp(time_s, attitude_s, heading_rad(attitude))
     rotation_rad = source_yaw_rad - yaw_rad
@@ -238,27 +244,30 @@ def _compare_orientations(
 
 
 def _estimate_from_positions(
-    flight: Flight, samples: pd.DataFrame, noises: Noises, dt_s: float, *, is_constant: bool
+    flight: Flight,
+    position_samples: pd.DataFrame,
+    noises: Noises,
+    dt_s: float,
+    *,
+    has_constant_heading: bool,
 ) -> HeadingError | Unavailable:
     """Estimate the heading error of each part of the flight from positions and IMU.
 
-    With ``is_constant``, all parts have the same heading error.
+    With ``has_constant_heading``, all parts have the same heading error.
     """
-    time_s = samples.index.to_numpy()
-    part_length_s = max(
-        POSITION_PART_LENGTH_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s)
-    )
-    signals = SignalCache()
+    time_s = position_samples.index.to_numpy()
+    part_length_s = max(POSITION_PART_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s))
+    signal_cache = SignalCache()
     rotation_rad = 0.0
     for _ in range(MAX_LINEARISATIONS):
         c, s = np.cos(rotation_rad), np.sin(rotation_rad)
         motion = prepare_motion(
             flight,
             time_s,
-            samples.to_numpy() @ np.array([[c, -s], [s, c]]),
+            position_samples.to_numpy() @ np.array([[c, -s], [s, c]]),
             directions=np.eye(3)[:2],
             dt_s=dt_s,
-            signals=signals,
+            signal_cache=signal_cache,
             heading_sigma_rad=HEADING_SIGMA_RAD,
             max_segment_s=part_length_s,
         )
@@ -272,40 +281,44 @@ def _estimate_from_positions(
                 f"no part of the flight without an IMU gap has {MIN_POSITION_PART_S:g} s",
                 "Analyse a longer segment.",
             )
-        positions = motion.at(0.0)
+        part_positions = motion.at(0.0)
         # use the path without IMU noise as sensitivity to the heading: noise would bias the
         # estimate to zero (errors in variables)
-        for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
+        for increments in (part_positions.delta_position_m, part_positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
-            increments[:, :, HEADING_CONSTANT] = -east_m, north_m
-        noises = maximise_likelihood([positions], noises, motion.weight, outliers=False).noises
-        fit = fit_noises([positions], noises, motion.weight)
+            increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
+        noises = maximise_likelihood(
+            [part_positions], noises, motion.weight, fits_outliers=False
+        ).noises
+        fit = fit_noises([part_positions], noises, motion.weight)
         constants = fit.constants()[is_long, 0]
-        covariance = np.linalg.inv(fit.information())[is_long, 0]
+        constant_covariance = np.linalg.inv(fit.information())[is_long, 0]
         # the path has the scale of the positions, which is estimated too
-        scale = np.maximum(1.0 + constants[:, -1], MIN_SCALE)
-        error_rad = constants[:, HEADING_CONSTANT] / scale
-        variance = covariance[:, HEADING_CONSTANT, HEADING_CONSTANT] / scale**2
-        step_rad, weight_sum = np.average(error_rad, weights=1.0 / variance, returned=True)
+        position_scale = np.maximum(1.0 + constants[:, -1], MIN_SCALE)
+        error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
+        heading_variance = (
+            constant_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
+        )
+        step_rad, weight_sum = np.average(error_rad, weights=1.0 / heading_variance, returned=True)
         rotation_rad += float(step_rad)
         if abs(step_rad) < MAX_FINAL_STEP_RAD:
             break
     difference_rad = error_rad - step_rad
     # variance of the true heading error: variance of the estimates minus that of their errors
-    excess_variance = max(float(np.mean(difference_rad**2 - variance)), 0.0)
-    drift_variance = 0.0 if is_constant else excess_variance
+    excess_variance = max(float(np.mean(difference_rad**2 - heading_variance)), 0.0)
+    drift_variance = 0.0 if has_constant_heading else excess_variance
     # shrink each estimate towards the mean, according to its estimation error
-    drift_fraction = drift_variance / (drift_variance + variance)
+    drift_fraction = drift_variance / (drift_variance + heading_variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [
         spans_s[is_long],
         np.degrees(rotation_rad + drift_fraction * difference_rad),
-        np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * variance)),
+        np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * heading_variance)),
     ]
-    chi_square = float(np.sum(difference_rad**2 / variance))
-    has_test = len(variance) > 1 and not is_constant
+    chi_square = float(np.sum(difference_rad**2 / heading_variance))
+    has_test = len(heading_variance) > 1 and not has_constant_heading
     return combine_heading_parts(
         tuple(HeadingPart(*row) for row in np.column_stack(parts).tolist()),
-        float(chdtrc(len(variance) - 1, chi_square)) if has_test else 1.0,
+        float(chdtrc(len(heading_variance) - 1, chi_square)) if has_test else 1.0,
         "positions",
     )

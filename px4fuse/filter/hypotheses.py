@@ -41,23 +41,23 @@ ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50
 # Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_SIGMA_RAD = 0.002
-# Interval (s) between the knots of the slow acceleration error, which is interpolated linearly
+# Interval (s) between the knots of the slowly varying acceleration error
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 # Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Tested factors on KF's SIGMA_A: with fitted biases and tilt, the acceleration noise is smaller
+# Tested factors on KF's SIGMA_A: fitted biases and tilt reduce the acceleration noise
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
-# Number of possible jump times per computation, which limits memory
+# Number of tested jump times per batch, which limits memory
 STEP_BATCH_SIZE = 200
-# Measurements within this time (s) after a jump are ignored: a burst of outliers is no jump
+# Time (s) after a jump in which measurements are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Outliers within this time (s) after a jump are tested again: they may be good shifted positions
+# Time (s) after a jump in which outliers are tested again: they may be shifted positions
 OUTLIERS_AFTER_STEP_S = 6.0
 # Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
@@ -66,9 +66,9 @@ MAX_FALSE_OUTLIER_P = 1e-3
 # Maximum number of candidates for the exact time of a jump
 MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
-# Minimum accelerometer bias for a finding: half of EKF2's limit EKF2_ABL_LIM
+# Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
 MIN_BIAS_M_S2 = 0.2
-# Minimum accelerometer bias in σ for a finding: false alarm probability 6e-5
+# Minimum accelerometer bias, in σ of its estimate, that is reported: false alarm rate 6e-5
 MIN_BIAS_SIGMAS = 4.0
 # Minimum number of measurements before and after a jump
 MIN_SIDE_MEASUREMENTS = 8
@@ -96,7 +96,7 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class BiasScaleJumpFit:
+class SystematicErrors:
     """Biases, scale factor error and jumps, fitted to the innovations of horizontal axes.
 
     Attributes
@@ -132,7 +132,7 @@ class BiasScaleJumpFit:
         return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
 
 
-def fit_bias_scale_jumps(
+def fit_systematic_errors(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -142,7 +142,7 @@ def fit_bias_scale_jumps(
     outlier_time_s: Array,
     clock_offset_s: float,
     announced_s: Sequence[float] = (),
-) -> BiasScaleJumpFit | Unavailable:
+) -> SystematicErrors | Unavailable:
     """Estimate accelerometer biases and scale factor error, and detect jumps of the source.
 
     Parameters
@@ -167,7 +167,7 @@ def fit_bias_scale_jumps(
     if (count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
         return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
-    sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
+    sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
     jumps, is_skipped = _find_jumps(
         design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in announced_s]
     )
@@ -175,10 +175,15 @@ def fit_bias_scale_jumps(
         design = replace(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
-        sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    forward_bias, right_bias, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
-    return BiasScaleJumpFit(
-        forward_bias, right_bias, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
+        sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
+    forward_bias, right_bias, frame_rotation = map(design_fit.estimate, (FORWARD, RIGHT, ROTATION))
+    return SystematicErrors(
+        forward_bias,
+        right_bias,
+        frame_rotation,
+        _fit_scale(design, sigma_a, is_skipped),
+        jumps,
+        sigma_a,
     )
 
 
@@ -194,9 +199,9 @@ def _fit_sigma_a(
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
     """Return the index of the only minimum of a sequence, searched from the middle."""
     index = count // 2
-    step = 1 if index + 1 < count and score(index + 1) < score(index) else -1
-    while 0 <= index + step < count and score(index + step) < score(index):
-        index += step
+    direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
+    while 0 <= index + direction < count and score(index + direction) < score(index):
+        index += direction
     return index
 
 
@@ -210,15 +215,17 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
         lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
     )
     grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
-    scores = [fit_at(grid_index + shift).square_sum / 2.0 for shift in (-1, 0, 1)]
-    vertex_shift, curvature = parabola_vertex(np.array(scores), 1)
-    step = float(SCALE_GRID[1] - SCALE_GRID[0])
+    scores_beside_minimum = [
+        fit_at(grid_index + grid_shift).square_sum / 2.0 for grid_shift in (-1, 0, 1)
+    ]
+    vertex_shift, curvature = parabola_vertex(np.array(scores_beside_minimum), 1)
+    grid_step = float(SCALE_GRID[1] - SCALE_GRID[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
-    scale = SCALE_GRID[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * step
-    sigma = step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
+    best_scale = SCALE_GRID[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
+    scale_sigma = grid_step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
     rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION])
-    return Estimate(float(scale * rotation_factor - 1.0), float(sigma))
+    return Estimate(float(best_scale * rotation_factor - 1.0), float(scale_sigma))
 
 
 def _find_jumps(
@@ -231,7 +238,7 @@ def _find_jumps(
     """
     jumps: list[Jump] = []
 
-    def skip_near(jump_s: float) -> BoolArray:
+    def skip_burst_after(jump_s: float) -> BoolArray:
         # an announced jump is no burst of outliers, so the positions after it are used
         if jump_s in announced_s:
             return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIERS_AFTER_STEP_S)
@@ -253,14 +260,20 @@ def _find_jumps(
         significant_jumps = [
             jump
             for time_s in jump_times
-            if (jump := _test_step(design, sigma_a, skip_near(time_s), time_s, false_alarm_p))
+            if (
+                jump := _test_step(design, sigma_a, skip_burst_after(time_s), time_s, false_alarm_p)
+            )
         ]
         if not significant_jumps:
             break
         best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
         best_jump, is_skipped = _locate_jump(design, sigma_a, is_skipped, best_jump)
         jumps.append(best_jump)
-        announced_s = [t for t in announced_s if abs(t - best_jump.time_s) > OUTLIER_BURST_S]
+        announced_s = [
+            announced_time_s
+            for announced_time_s in announced_s
+            if abs(announced_time_s - best_jump.time_s) > OUTLIER_BURST_S
+        ]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
 
@@ -269,43 +282,54 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 
 
 def _significant_step_times(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array | None = None
+    design: DesignMatrix,
+    sigma_a: float,
+    is_skipped: BoolArray,
+    candidate_times_s: Array | None = None,
 ) -> list[float]:
     """Return the times of significant jumps, largest χ² first; by default all times are tested."""
-    if times is None:
-        times = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
-        times = times[:: max(1, -(-len(times) // MAX_TESTED_TIMES))]
-    if not len(times):
+    if candidate_times_s is None:
+        candidate_times_s = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
+        candidate_times_s = candidate_times_s[
+            :: max(1, -(-len(candidate_times_s) // MAX_TESTED_TIMES))
+        ]
+    if not len(candidate_times_s):
         return []
-    chi_square = _step_chi_squares(design, sigma_a, is_skipped, times)
-    threshold = chdtri(design.axis_count, MAX_STEP_FALSE_ALARM_P / len(design.time_s))
-    order = np.argsort(-chi_square)
-    return [float(times[index]) for index in order if chi_square[index] >= threshold]
+    chi_square = _step_chi_squares(design, sigma_a, is_skipped, candidate_times_s)
+    min_chi_square = chdtri(design.axis_count, MAX_STEP_FALSE_ALARM_P / len(design.time_s))
+    descending_order = np.argsort(-chi_square)
+    return [
+        float(candidate_times_s[index])
+        for index in descending_order
+        if chi_square[index] >= min_chi_square
+    ]
 
 
 def _step_chi_squares(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, candidate_times_s: Array
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
-    data, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
-    base_fit = design.regress(data, columns, log_variance_sum, is_skipped)
-    chi_square = np.zeros(len(times))
-    for batch in np.array_split(np.arange(len(times)), -(-len(times) // STEP_BATCH_SIZE)):
-        step_signals = unit_steps(design.time_s, times[batch])
+    whitened_innovations, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
+    base_fit = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
+    chi_squares = np.zeros(len(candidate_times_s))
+    for batch in np.array_split(
+        np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // STEP_BATCH_SIZE)
+    ):
+        step_signals = unit_steps(design.time_s, candidate_times_s[batch])
         zero_signal = np.broadcast_to(0.0, step_signals.shape)
         step_response = design.whitened(
             zero_signal, zero_signal, step_signals, sigma_a, is_skipped
         )[0][~is_skipped]
-        for axis in range(design.axis_count):
-            residual = base_fit.residual[base_fit.axis == axis]
-            cross_product = columns[axis][~is_skipped].T @ step_response
-            information = np.sum(step_response**2, axis=0) - np.sum(
+        for axis_index in range(design.axis_count):
+            axis_residual = base_fit.residual[base_fit.axis == axis_index]
+            cross_product = columns[axis_index][~is_skipped].T @ step_response
+            step_information = np.sum(step_response**2, axis=0) - np.sum(
                 cross_product * (base_fit.covariance @ cross_product), axis=0
             )
-            chi_square[batch] += (
-                residual @ step_response / base_fit.axis_rms[axis]
-            ) ** 2 / np.maximum(information, 1e-9)
-    return chi_square
+            chi_squares[batch] += (
+                axis_residual @ step_response / base_fit.axis_rms[axis_index]
+            ) ** 2 / np.maximum(step_information, 1e-9)
+    return chi_squares
 
 
 def _locate_jump(
@@ -314,32 +338,40 @@ def _locate_jump(
     """Return a detected jump with its exact time and length, and a mask of outliers."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
     # exclude the measurements near the jump; use later outliers again if they agree with the jump
-    chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
+    residual_squares = design.with_step(jump.time_s)[0].residual_squares(
+        sigma_a, is_skipped | is_near
+    )
     is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
-    threshold = chdtri(design.axis_count, MAX_FALSE_OUTLIER_P)
-    is_skipped = np.where(is_after & ~is_near, chi_square > threshold, is_skipped)
-    times = design.time_s[is_near]
-    best_indices = np.argsort(-_step_chi_squares(design, sigma_a, is_skipped & ~is_near, times))[
-        :MAX_CANDIDATE_TIMES
-    ]
+    max_residual_square = chdtri(design.axis_count, MAX_FALSE_OUTLIER_P)
+    is_skipped = np.where(is_after & ~is_near, residual_squares > max_residual_square, is_skipped)
+    candidate_times_s = design.time_s[is_near]
+    best_indices = np.argsort(
+        -_step_chi_squares(design, sigma_a, is_skipped & ~is_near, candidate_times_s)
+    )[:MAX_CANDIDATE_TIMES]
     outliers_by_time = {}
-    for jump_s in times[best_indices].tolist():
-        chi_square = design.with_step(jump_s)[0].residual_squares(sigma_a, is_skipped | is_near)
-        outliers_by_time[jump_s] = np.where(is_near, chi_square > threshold, is_skipped)
+    for jump_s in candidate_times_s[best_indices].tolist():
+        residual_squares = design.with_step(jump_s)[0].residual_squares(
+            sigma_a, is_skipped | is_near
+        )
+        outliers_by_time[jump_s] = np.where(
+            is_near, residual_squares > max_residual_square, is_skipped
+        )
     # with a wrong jump time, good measurements look like outliers: choose the time with the fewest
-    time_s = min(outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s]))
-    is_skipped = outliers_by_time[time_s]
-    stepped_design, columns = design.with_step(time_s)
+    best_time_s = min(
+        outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s])
+    )
+    is_skipped = outliers_by_time[best_time_s]
+    stepped_design, step_column_indices = design.with_step(best_time_s)
     design_fit = stepped_design.fit(sigma_a, is_skipped)
-    step_m = tuple(design_fit.estimate(int(column)) for column in columns)
-    return replace(jump, time_s=time_s, step_m=step_m), is_skipped
+    step_m = tuple(design_fit.estimate(int(column)) for column in step_column_indices)
+    return replace(jump, time_s=best_time_s, step_m=step_m), is_skipped
 
 
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
     """Test a jump without the skipped measurements; return None if it is not significant."""
-    design, columns = design.with_step(time_s)
+    design, step_column_indices = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
         min(count_before, np.count_nonzero(~is_skipped & (design.time_s >= time_s)))
@@ -347,13 +379,17 @@ def _test_step(
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped)
-    jump_m = design_fit.coefficients[columns]
-    covariance = design_fit.covariance[np.ix_(columns, columns)]
+    jump_m = design_fit.coefficients[step_column_indices]
+    step_covariance = design_fit.covariance[np.ix_(step_column_indices, step_column_indices)]
     jump_m = jump_m / design_fit.axis_rms
-    chi_square = float(jump_m @ np.linalg.solve(covariance, jump_m))
-    if chi_square < chdtri(len(columns), false_alarm_p):
+    chi_square = float(jump_m @ np.linalg.solve(step_covariance, jump_m))
+    if chi_square < chdtri(len(step_column_indices), false_alarm_p):
         return None
-    return Jump(time_s, tuple(design_fit.estimate(int(column)) for column in columns), chi_square)
+    return Jump(
+        time_s,
+        tuple(design_fit.estimate(int(column)) for column in step_column_indices),
+        chi_square,
+    )
 
 
 @dataclass(frozen=True)
@@ -391,8 +427,10 @@ class DesignFit:
 
     def estimate(self, column: int) -> Estimate:
         """Return one coefficient; its σ includes a ``residual_rms`` above 1."""
-        sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
-        return Estimate(float(self.coefficients[column]), sigma)
+        coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
+            self.residual_rms, 1.0
+        )
+        return Estimate(float(self.coefficients[column]), coefficient_sigma)
 
 
 @dataclass(frozen=True)
@@ -425,8 +463,8 @@ class DesignMatrix:
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
         first_step_column = len(self.prior_sigma)
-        count = design.step_columns.shape[1]
-        return design, first_step_column + count * (1 + np.arange(self.axis_count)) - 1
+        step_count = design.step_columns.shape[1]
+        return design, first_step_column + step_count * (1 + np.arange(self.axis_count)) - 1
 
     def whitened(
         self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
@@ -447,45 +485,57 @@ class DesignMatrix:
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
     def regress(
-        self, data: Array, columns: Array, log_variance_sum: float, is_skipped: BoolArray
+        self,
+        innovations_by_axis: Array,
+        columns: Array,
+        log_variance_sum: float,
+        is_skipped: BoolArray,
     ) -> DesignFit:
         """Fit whitened innovations with whitened columns (from :meth:`whitened_design`)."""
-        axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
-        data = data[:, ~is_skipped].ravel()
-        columns = columns[:, ~is_skipped].reshape(len(axis), -1)
-        count = columns.shape[1]
-        prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
+        axis_indices = np.repeat(np.arange(len(innovations_by_axis)), np.count_nonzero(~is_skipped))
+        innovations_by_axis = innovations_by_axis[:, ~is_skipped].ravel()
+        columns = columns[:, ~is_skipped].reshape(len(axis_indices), -1)
+        column_count = columns.shape[1]
+        prior_sigma = np.append(
+            self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
+        )
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
         # a small diagonal keeps the matrix regular if a column is zero, as the frame rotation in
         # hover
-        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
-        moment = columns.T @ data
-        factor = cho_factor(information)
-        covariance = cho_solve(factor, np.eye(count))
+        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
+        moment = columns.T @ innovations_by_axis
+        information_factor = cho_factor(information)
+        covariance = cho_solve(information_factor, np.eye(column_count))
         coefficients = covariance @ moment
-        square_sum = float(data @ data - coefficients @ moment)
-        score = 0.5 * (square_sum + log_variance_sum) + float(np.sum(np.log(np.diag(factor[0]))))
-        residual_rms = float(np.sqrt(max(square_sum, 0.0) / max(len(data) - CONSTANT_COUNT, 1)))
-        residual = data - columns @ coefficients
-        return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
+        square_sum = float(innovations_by_axis @ innovations_by_axis - coefficients @ moment)
+        score = 0.5 * (square_sum + log_variance_sum) + float(
+            np.sum(np.log(np.diag(information_factor[0])))
+        )
+        residual_rms = float(
+            np.sqrt(max(square_sum, 0.0) / max(len(innovations_by_axis) - CONSTANT_COUNT, 1))
+        )
+        residual = innovations_by_axis - columns @ coefficients
+        return DesignFit(
+            axis_indices, residual, coefficients, covariance, square_sum, score, residual_rms
+        )
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
         """Return the squared normalised residual of each measurement, summed over axes."""
-        data, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
-        fit = self.regress(data, columns, log_variance_sum, is_skipped)
-        residual = data - columns @ fit.coefficients
-        return np.asarray(np.sum(residual**2, axis=0)) / max(fit.residual_rms, 1.0) ** 2
+        whitened_innovations, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
+        design_fit = self.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
+        residual = whitened_innovations - columns @ design_fit.coefficients
+        return np.asarray(np.sum(residual**2, axis=0)) / max(design_fit.residual_rms, 1.0) ** 2
 
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
         """Return whitened innovations (a, m), their design matrix (a, m, k), and Σ ln S."""
-        signals, axes, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
+        signals, axis_count, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
         column_count = len(self.prior_sigma)
-        data = np.empty((axes, len(is_skipped)))
-        columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
+        whitened_innovations = np.empty((axis_count, len(is_skipped)))
+        columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * step_count))
         # the scale does not multiply the biases
-        data_columns = (1 + CONSTANT_COUNT) * np.arange(axes)
+        data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
         scales = np.ones(signals.measurement_m.shape[1])
         scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
         no_motion = 0.0 * self.step_columns
@@ -497,11 +547,11 @@ class DesignMatrix:
             is_skipped,
         )
         *axis_signals, common_signals = np.split(
-            normalised, (1 + CONSTANT_COUNT) * np.arange(1, 1 + axes), 1
+            normalised, (1 + CONSTANT_COUNT) * np.arange(1, 1 + axis_count), 1
         )
         hat_count = common_signals.shape[1] - step_count
         for axis, axis_signal in enumerate(axis_signals):
-            data[axis] = axis_signal[:, 0]
+            whitened_innovations[axis] = axis_signal[:, 0]
             first_hat = CONSTANT_COUNT + hat_count * axis
             first_step = column_count + step_count * axis
             columns[axis][:, :CONSTANT_COUNT] = axis_signal[:, 1:]
@@ -509,7 +559,7 @@ class DesignMatrix:
                 first_hat : first_hat + hat_count, first_step : first_step + step_count
             ]
             columns[axis][:, common_columns] = common_signals
-        return data, columns, axes * log_variance_sum
+        return whitened_innovations, columns, axis_count * log_variance_sum
 
 
 def make_design_matrix(
@@ -570,9 +620,11 @@ def make_design_matrix(
 
 def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline) -> ArrayPair:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements."""
-    time = np.asarray(time_s, dtype=np.float64)
-    velocity = np.interp(timeline.time_s, time, cumulative_integral(acceleration_m_s2, time))
-    return integrate_acceleration(timeline, np.diff(velocity) / np.diff(timeline.time_s))
+    signal_time_s = np.asarray(time_s, dtype=np.float64)
+    velocity_m_s = np.interp(
+        timeline.time_s, signal_time_s, cumulative_integral(acceleration_m_s2, signal_time_s)
+    )
+    return integrate_acceleration(timeline, np.diff(velocity_m_s) / np.diff(timeline.time_s))
 
 
 def _common_accelerations(
@@ -590,9 +642,11 @@ def _common_accelerations(
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
     """Return times (s), and at these times the linear interpolation weight of each knot."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
-    time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
-    knots = np.linspace(start_s, end_s, knot_count)
-    return time, np.array([np.interp(time, knots, weights) for weights in np.eye(knot_count)])
+    hat_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
+    knot_times_s = np.linspace(start_s, end_s, knot_count)
+    return hat_time_s, np.array(
+        [np.interp(hat_time_s, knot_times_s, weights) for weights in np.eye(knot_count)]
+    )
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:

@@ -40,28 +40,28 @@ CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
 # 0.12 rad, with a linearisation error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
-# Largest time offset (s) of the search
+# Maximum tested time offset (s) between position source and IMU
 MAX_OFFSET_S = 0.6
-# Number of time offsets in the coarse search over the whole range
-COARSE_OFFSETS = 25
-# Approximate number of measurements in the coarse search for a time offset
+# Number of tested time offsets in the coarse search
+COARSE_OFFSET_COUNT = 25
+# Approximate number of position measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
-# Maximum number of values per computation, which limits memory
+# Maximum number of array elements per batch of time offsets, which limits memory
 SIGNALS_PER_BATCH = 2**16
 # Minimum number of time offsets that are computed together
 MIN_BATCH_OFFSETS = 3
-# Minimum number of measurements in all segments together
+# Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
-# Minimum number of measurements in a segment
+# Minimum number of position measurements in a segment
 MIN_SEGMENT_MEASUREMENTS = 15
-# Minimum number of measurements in a segment after downsampling
+# Minimum number of position measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
 # it avoids a singular matrix
 START_PRECISION = 1e-6, 1e-4
-# Maximum median interval (s) of IMU samples: in a longer interval the motion is unknown
+# Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
 
 
@@ -94,7 +94,7 @@ SignalCache = dict[Span, Signals]
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source and motion from the IMU, in s segments, for any time offset.
+    """Position measurements and IMU motion of s segments, for any time offset.
 
     Attributes
     ----------
@@ -123,11 +123,11 @@ class PreparedMotion:
     imu_interval_s: float
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
-    def downsample(self, count: int) -> PreparedMotion:
-        """Keep about ``count`` measurements; keep all if every segment would get too few."""
-        is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
-        counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
-        keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
+    def downsample(self, max_count: int) -> PreparedMotion:
+        """Keep about ``max_count`` measurements; keep all if every segment would get too few."""
+        is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_count)) == 0
+        kept_counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
+        keeps_enough = kept_counts >= MIN_KEPT_MEASUREMENTS
         if not keeps_enough.any():
             return self
         is_kept &= np.repeat(keeps_enough, np.diff(self.edges))
@@ -135,7 +135,9 @@ class PreparedMotion:
             name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
         }
         signals = tuple(self.signals[index] for index in np.flatnonzero(keeps_enough))
-        return replace(self, **arrays, edges=np.cumsum([0, *counts[keeps_enough]]), signals=signals)
+        return replace(
+            self, **arrays, edges=np.cumsum([0, *kept_counts[keeps_enough]]), signals=signals
+        )
 
     def positions(self, offset_s: Array) -> Positions:
         """Return positions and integrated IMU data for each time offset, with a known scale."""
@@ -143,18 +145,18 @@ class PreparedMotion:
         noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.edges[:-1]] = START_PRECISION
-        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMAS), len(length_s)
-        dp, dv = np.zeros((2, *shape))
+        signal_shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMAS), len(length_s)
+        dp, dv = np.zeros((2, *signal_shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
-            time = self.time_s[begin:end]
+            measured_s = self.time_s[begin:end]
             # both arrays have the shape (axes, time offsets, constants, times)
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
-                for signal in signals.at(time + offset_s[:, None])
+                for signal in signals.at(measured_s + offset_s[:, None])
             )
-            rows = np.s_[:, :, :-1, begin : end - 1]
-            dv[rows] = np.diff(velocity)
-            dp[rows] = np.diff(position) - velocity[..., :-1] * np.diff(time)
+            interval_rows = np.s_[:, :, :-1, begin : end - 1]
+            dv[interval_rows] = np.diff(velocity)
+            dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measured_s)
         return Positions(
             measurement_m=self.measurement_m,
             segment_starts=self.edges[:-1],
@@ -180,26 +182,32 @@ class PreparedMotion:
             yield centre_on_path(positions, has_scale=True) if has_scale else positions
 
     def search_offset(
-        self, noises: Noises, factors: Sequence[float] = (1.0,), *, has_scale: bool = True
+        self, noises: Noises, sigma_a_factors: Sequence[float] = (1.0,), *, has_scale: bool = True
     ) -> tuple[float, Noises]:
         """Return time offset and noises with the maximum likelihood on a coarse grid.
 
-        ``factors`` are the tested factors on SIGMA_A; ``has_scale`` is True for an unknown scale.
+        ``sigma_a_factors`` are tested on SIGMA_A; ``has_scale`` is True for an unknown scale.
         """
-        offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
-        sigma = noises.sigma_z_m
-        ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
+        tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
+        sigma_z_m = noises.sigma_z_m
+        sigma_ratios = [
+            sigma_a_factor * noises.sigma_a_m_s2 / sigma_z_m for sigma_a_factor in sigma_a_factors
+        ]
         coarse_motion = self.downsample(COARSE_MEASUREMENTS)
-        position_batches = coarse_motion.position_batches(offsets, has_scale=has_scale)
+        position_batches = coarse_motion.position_batches(tested_offsets_s, has_scale=has_scale)
         ratio_fits = fit_ratios(
-            position_batches, ratios, noises.random_walk_m / sigma, coarse_motion.weight, sigma
+            position_batches,
+            sigma_ratios,
+            noises.random_walk_m / sigma_z_m,
+            coarse_motion.weight,
+            sigma_z_m,
         )
-        minus_log_likelihood = np.stack([fit.scaled(sigma).scores()[0] for fit in ratio_fits])
+        minus_log_likelihood = np.stack([fit.scaled(sigma_z_m).scores()[0] for fit in ratio_fits])
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
         )
-        sigma_a = noises.sigma_a_m_s2 * factors[int(factor_index)]
-        return float(offsets[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
+        sigma_a = noises.sigma_a_m_s2 * sigma_a_factors[int(factor_index)]
+        return float(tested_offsets_s[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
 
 
 def prepare_motion(
@@ -210,7 +218,7 @@ def prepare_motion(
     directions: Array,
     dt_s: float,
     weight: Array | None = None,
-    signals: SignalCache | None = None,
+    signal_cache: SignalCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
@@ -223,7 +231,7 @@ def prepare_motion(
     measurement_m : ndarray, shape (m, a)
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
-    signals : dict, optional
+    signal_cache : dict, optional
         IMU motion of this flight that was already computed; new motion is added.
     max_segment_s : float
         Maximum length of a segment.
@@ -234,7 +242,7 @@ def prepare_motion(
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
-    signals = {} if signals is None else signals
+    signal_cache = {} if signal_cache is None else signal_cache
     segment_signals: list[Signals] = []
     imu_s = imu.index.to_numpy()
     attitude_s = attitude.index.to_numpy()
@@ -246,8 +254,8 @@ def prepare_motion(
         if not len(covered_rows):
             continue
         covered_s = time_s[covered_rows]
-        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / max_segment_s)))
-        cut_times_s = np.linspace(covered_s[0], covered_s[-1], count + 1)[1:-1]
+        segment_count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / max_segment_s)))
+        cut_times_s = np.linspace(covered_s[0], covered_s[-1], segment_count + 1)[1:-1]
         for segment_rows in np.split(covered_rows, np.searchsorted(covered_s, cut_times_s)):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
                 rows_by_segment.append(segment_rows)
@@ -255,9 +263,9 @@ def prepare_motion(
                     time_s[segment_rows[0]] - MAX_OFFSET_S,
                     time_s[segment_rows[-1]] + MAX_OFFSET_S,
                 )
-                if span not in signals:
-                    signals[span] = make_signals(imu, attitude, span)
-                segment_signals.append(signals[span])
+                if span not in signal_cache:
+                    signal_cache[span] = make_signals(imu, attitude, span)
+                segment_signals.append(signal_cache[span])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
@@ -266,16 +274,16 @@ def prepare_motion(
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    edges = np.cumsum([0, *map(len, rows_by_segment)])
+    segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
     # the initial position is unknown, and small numbers limit rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
-    segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
+    segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_m = measured_m.groupby(segment_index).transform("first")
     return PreparedMotion(
         time_s[used_rows],
         (measured_m - first_m).to_numpy(),
         np.ones(len(used_rows)) if weight is None else weight[used_rows],
-        edges,
+        segment_edges,
         tuple(segment_signals),
         directions,
         dt_s,
@@ -288,31 +296,33 @@ def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
     """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
-    gaps = np.flatnonzero(imu_gaps(imu_s))
-    starts_s = np.maximum(imu_s[np.r_[0, gaps + 1]], attitude_s[0])
-    ends = np.minimum(imu_s[np.r_[gaps, len(imu_s) - 1]], attitude_s[-1])
+    gap_indices = np.flatnonzero(imu_gaps(imu_s))
+    starts_s = np.maximum(imu_s[np.r_[0, gap_indices + 1]], attitude_s[0])
+    ends = np.minimum(imu_s[np.r_[gap_indices, len(imu_s) - 1]], attitude_s[-1])
     return list(zip(starts_s.tolist(), ends.tolist(), strict=True))
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signals:
     """Compute the motion in NED from the IMU, and its sensitivity to each constant."""
-    time = imu.index.to_numpy()
+    imu_s = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
-        time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
+        imu_s, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
     )
-    samples = imu.iloc[first_row:end_row]
-    time = time[first_row:end_row]
+    imu_samples = imu.iloc[first_row:end_row]
+    imu_s = imu_s[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    integral = cumulative_integral(samples[columns].to_numpy(), time)
-    step_times_s = np.arange(time[0], time[-1], INTEGRATION_STEP_S)
-    integrals = np.column_stack([np.interp(step_times_s, time, column) for column in integral.T])
-    force = integrals[:, :3]
-    angle = integrals[:, 3:]
-    attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
+    imu_integral = cumulative_integral(imu_samples[columns].to_numpy(), imu_s)
+    step_times_s = np.arange(imu_s[0], imu_s[-1], INTEGRATION_STEP_S)
+    integrals_at_steps = np.column_stack(
+        [np.interp(step_times_s, imu_s, column) for column in imu_integral.T]
+    )
+    velocity_increment = integrals_at_steps[:, :3]
+    rotation_vector = integrals_at_steps[:, 3:]
+    attitude_quaternion = _integrate_gyros(step_times_s, rotation_vector, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
-    mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
+    mean_force = np.diff(velocity_increment, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
+        multiply(attitude_quaternion[:-1], from_vector(np.diff(rotation_vector, axis=0) / 2.0))
     )
     force_ned = rotate(body_to_ned, mean_force)
     table = np.zeros((len(mean_force), 3, 3, len(CONSTANT_SIGMAS)))

@@ -122,18 +122,27 @@ def _run_filterpy(
     kalman.inv = np.reciprocal  # S is 1 by 1
     states: Rows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
     updates: Rows = []
-    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+    for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         kalman.predict(
             u=np.array([[acceleration]]),
             B=np.array([[dt_s**2 / 2.0], [dt_s]]),
             F=model.transition(dt_s),
             Q=noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s)),
         )
-        if z is not None:
-            kalman.update(z)
+        if measured_m is not None:
+            kalman.update(measured_m)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
             updates.append(
-                (z, kalman.y[0, 0], kalman.S[0, 0], K[0, 0], K[1, 0], x[0, 0], P[0, 0], P[1, 1])
+                (
+                    measured_m,
+                    kalman.y[0, 0],
+                    kalman.S[0, 0],
+                    K[0, 0],
+                    K[1, 0],
+                    x[0, 0],
+                    P[0, 0],
+                    P[1, 1],
+                )
             )
         x, P = kalman.x, kalman.P
         states.append((x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]))
@@ -151,15 +160,17 @@ def _run_floats(
     )
     states: Rows = [(position, velocity, *covariance)]
     updates: Rows = []
-    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+    for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         position, velocity, covariance = model.predict_step(
             position, velocity, covariance, acceleration, noise_density, dt_s
         )
-        if z is not None:
+        if measured_m is not None:
             innovation_and_gains, updated_state = model.update_step(
-                position, velocity, covariance, z, measurement_variance
+                position, velocity, covariance, measured_m, measurement_variance
             )
-            updates.append((z, *innovation_and_gains, position, covariance[0], covariance[2]))
+            updates.append(
+                (measured_m, *innovation_and_gains, position, covariance[0], covariance[2])
+            )
             position, velocity, covariance = updated_state
         states.append((position, velocity, *covariance))
     return states, updates

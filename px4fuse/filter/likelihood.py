@@ -35,7 +35,7 @@ START_LOG_DISTANCE = 0.05
 # Maximum change of the other noise's logarithm (for example SIGMA_Z in the profile of SIGMA_A)
 # between two points of a likelihood profile
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of the other noise's logarithm at each point of a likelihood profile
+# Tolerance of the other noise's logarithm at each point of a profile likelihood
 OTHER_LOG_TOLERANCE = 2e-3
 
 
@@ -77,9 +77,9 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     """
     timeline = make_timeline(axis, settings)
     last_steps, interval_index, remaining_s = _interval_index(timeline)
-    time = timeline.time_s
+    step_times_s = timeline.time_s
     noise_unit = settings.dt_s * np.stack(
-        propagate_covariance(process_noise_unit(np.diff(time)), remaining_s), 1
+        propagate_covariance(process_noise_unit(np.diff(step_times_s)), remaining_s), 1
     )
     dp, dv = integrate_acceleration(timeline, timeline.acceleration_m_s2)
 
@@ -87,13 +87,13 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
         return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
 
     return Preintegrated(
-        length_s=np.diff(time[np.append(0, last_steps)]),
+        length_s=np.diff(step_times_s[np.append(0, last_steps)]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         noise_unit=sum_by_interval(noise_unit),
         noise_fixed=sum_by_interval(noise_unit * timeline.input_variance_m2_s4[:, None]),
         measurement_m=axis.measurement_m[timeline.measurement_index[last_steps]],
-        initial=InitialState(float(time[0]), float(axis.measurement_m[0])),
+        initial=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
     )
 
 
@@ -195,14 +195,18 @@ def profile_interval(
 
     An end outside the grid is None. ``max_drop`` is the drop of the log-likelihood at the ends.
     """
-    drop = profile - profile.min()
-    first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
+    score_drops = profile - profile.min()
+    first_index, last_index = np.flatnonzero(score_drops <= max_drop)[[0, -1]]
 
-    def interpolate_end(inside_index: int, outside: int) -> float | None:
-        if not 0 <= outside < len(grid):
+    def interpolate_end(inside_index: int, outside_index: int) -> float | None:
+        if not 0 <= outside_index < len(grid):
             return None
-        fraction = (max_drop - drop[inside_index]) / (drop[outside] - drop[inside_index])
-        return float(grid[inside_index] + fraction * (grid[outside] - grid[inside_index]))
+        grid_fraction = (max_drop - score_drops[inside_index]) / (
+            score_drops[outside_index] - score_drops[inside_index]
+        )
+        return float(
+            grid[inside_index] + grid_fraction * (grid[outside_index] - grid[inside_index])
+        )
 
     return interpolate_end(first_index, first_index - 1), interpolate_end(
         last_index, last_index + 1
@@ -232,30 +236,30 @@ def profile_ends(
     best_score = score(*best_logs)
     max_root_drop = float(np.sqrt(PROFILE_DROP * variance_factor))
 
-    def find_end(direction: float, bound: float) -> float | None:
+    def find_interval_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
         # the square root of the drop is nearly linear in the distance, which helps brentq
         @cache
-        def excess(distance: float) -> float:
+        def excess_root_drop(log_distance: float) -> float:
             nonlocal other_log
-            if distance == 0.0:
+            if log_distance == 0.0:
                 return -max_root_drop
-            result = minimize_scalar(
-                lambda log_value: score(best_logs[0] + direction * distance, log_value),
+            other_minimum = minimize_scalar(
+                lambda log_value: score(best_logs[0] + direction * log_distance, log_value),
                 bounds=(other_log - MAX_OTHER_LOG_STEP, other_log + MAX_OTHER_LOG_STEP),
                 options={"xatol": OTHER_LOG_TOLERANCE},
             )
-            other_log = float(result.x)
-            return float(np.sqrt(max(result.fun - best_score, 0.0)) - max_root_drop)
+            other_log = float(other_minimum.x)
+            return float(np.sqrt(max(other_minimum.fun - best_score, 0.0)) - max_root_drop)
 
         max_distance = direction * (float(np.log(bound)) - best_logs[0])
         distance_limit = min(START_LOG_DISTANCE, max_distance)
-        while excess(distance_limit) < 0.0:
+        while excess_root_drop(distance_limit) < 0.0:
             if distance_limit == max_distance:
                 return None
             distance_limit = min(2.0 * distance_limit, max_distance)
-        distance = brentq(excess, 0.0, distance_limit, xtol=1e-3 * distance_limit)
-        return float(np.exp(best_logs[0] + direction * distance))
+        log_distance = brentq(excess_root_drop, 0.0, distance_limit, xtol=1e-3 * distance_limit)
+        return float(np.exp(best_logs[0] + direction * log_distance))
 
-    return find_end(-1.0, bounds[0]), find_end(1.0, bounds[1])
+    return find_interval_end(-1.0, bounds[0]), find_interval_end(1.0, bounds[1])

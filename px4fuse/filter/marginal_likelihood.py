@@ -33,16 +33,16 @@ from scipy.linalg import lapack
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoothed path that is subtracted from the positions
-PATH_NOISES = 0.5, 0.1
+# SIGMA_A (m/s²) and SIGMA_Z (m) for the smoothed path, which is subtracted from the positions
+SMOOTHED_PATH_NOISES = 0.5, 0.1
 # Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise (σ) that each interval adds, relative to the measurement noise and to Q: it
 # makes a singular Q invertible
 MIN_NOISE_RATIO = 1e-5
-# Number of signals per computation: more need more memory and are not faster
+# Number of input signals per batch, which limits memory
 SIGNAL_BATCH_SIZE = 8
-# Smaller determinants of Q, relative to the product of its diagonal, are rounding errors
+# Minimum determinant of Q ÷ product of its diagonal: smaller values are rounding errors
 MIN_DETERMINANT_RATIO = 1e-12
 
 
@@ -113,7 +113,7 @@ class Positions:
         )
         return scaled_positions, 1.0 / np.concatenate([start_weights, weight])
 
-    def factorised_systems(
+    def factorised_equations(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
         """Yield (axes, factorised normal equations, degrees of freedom of one axis).
@@ -121,7 +121,7 @@ class Positions:
         Axes that are measured at the same times have the same equations.
         """
         is_measured = np.isfinite(self.measurement_m)
-        noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
+        process_noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
         axes_left = list(range(is_measured.shape[1]))
         while axes_left:
             is_axis_measured = is_measured[:, axes_left[0]]
@@ -129,24 +129,30 @@ class Positions:
                 axis for axis in axes_left if np.array_equal(is_measured[:, axis], is_axis_measured)
             ]
             axes_left = [axis for axis in axes_left if axis not in axes]
-            precision = self.prior_precision.copy()
+            state_precision = self.prior_precision.copy()
             # fewer than two measurements do not determine the initial state of a segment: it gets a
             # prior and does not contribute to the likelihood
             has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
                 has_too_few, np.diff([*self.segment_starts, len(is_measured)])
             )
-            precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
-            precision[self.segment_starts[has_too_few]] += 1.0
-            is_known = (precision > 0.0) & (
-                (precision > self.prior_precision)
+            state_precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
+            state_precision[self.segment_starts[has_too_few]] += 1.0
+            is_known = (state_precision > 0.0) & (
+                (state_precision > self.prior_precision)
                 | (self.prior_precision > MIN_KNOWN_START_PRECISION)
             )
             system = factorise(
-                self.length_s, noise, self.is_joined, precision, self.correlated_noise
+                self.length_s,
+                process_noise,
+                self.is_joined,
+                state_precision,
+                self.correlated_noise,
             )
             # the weak prior of an unknown initial state must not contribute to the likelihood
-            log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
+            log_unknown_precision = float(
+                np.sum(np.log(state_precision[(state_precision > 0.0) & ~is_known]))
+            )
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
             yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
 
@@ -188,14 +194,16 @@ class FittedPositions:
 
         ``scales`` are k factors on all noises.
         """
-        gram = self.gram / scales[:, None, None, None, None] ** 2
-        sigma = self.constant_sigma
-        information = gram[..., 1:, 1:] * np.outer(sigma, sigma) + np.eye(len(sigma))
-        cross_products = gram[..., 1:, 0] * sigma
+        scaled_gram = self.gram / scales[:, None, None, None, None] ** 2
+        prior_sigma = self.constant_sigma
+        information = scaled_gram[..., 1:, 1:] * np.outer(prior_sigma, prior_sigma) + np.eye(
+            len(prior_sigma)
+        )
+        cross_products = scaled_gram[..., 1:, 0] * prior_sigma
         cholesky = np.linalg.cholesky(information)
-        solution = np.linalg.solve(information, cross_products[..., None])[..., 0]
+        estimated_constants = np.linalg.solve(information, cross_products[..., None])[..., 0]
         log_diagonal = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
-        square_sum = gram[..., 0, 0] - np.sum(cross_products * solution, axis=-1)
+        square_sum = scaled_gram[..., 0, 0] - np.sum(cross_products * estimated_constants, axis=-1)
         return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
@@ -221,22 +229,27 @@ def fit_positions(
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
     log_determinant = 0.0
     degrees_of_freedom = 0
-    for axes, system, axis_degrees_of_freedom in positions.factorised_systems(
+    for axes, system, axis_degrees_of_freedom in positions.factorised_equations(
         sigma_a_m_s2, variance_m2
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        data = measured_m[axes]
-        intervals, explained = system.whiten(data, dp[axes], dv[axes])
-        signals = (np.sqrt(system.precision[:, 0]) * data, *intervals, explained)
+        axes_measured_m = measured_m[axes]
+        intervals, explained = system.whiten(axes_measured_m, dp[axes], dv[axes])
+        signals = (np.sqrt(system.precision[:, 0]) * axes_measured_m, *intervals, explained)
         for segment_index, (begin, end) in enumerate(positions.segments):
-            rows = slice(begin, end - 1)
-            states = slice(system.state_count * begin, system.state_count * end)
+            interval_rows = slice(begin, end - 1)
+            state_columns = slice(system.state_count * begin, system.state_count * end)
             for sign, array, columns in zip(
-                (1.0, 1.0, 1.0, -1.0), signals, (slice(begin, end), rows, rows, states), strict=True
+                (1.0, 1.0, 1.0, -1.0),
+                signals,
+                (slice(begin, end), interval_rows, interval_rows, state_columns),
+                strict=True,
             ):
-                signal = array[..., columns]
-                gram[segment_index] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
+                segment_signal = array[..., columns]
+                gram[segment_index] += sign * (
+                    segment_signal @ np.swapaxes(segment_signal, -1, -2)
+                ).sum(axis=0)
     return FittedPositions(gram, log_determinant, degrees_of_freedom, positions.constant_sigma)
 
 
@@ -249,19 +262,19 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
     dv = positions.delta_velocity_m_s.copy()
-    sigma_a, sigma_z = PATH_NOISES
-    for axes, system, _ in positions.factorised_systems(
+    sigma_a, sigma_z = SMOOTHED_PATH_NOISES
+    for axes, system, _ in positions.factorised_equations(
         sigma_a, np.full(len(measured_m), sigma_z**2)
     ):
-        data = np.nan_to_num(measured_m[:, axes].T)[:, None]
-        state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
-        state[:, :, positions.segment_starts] = 0.0
-        path = state[..., 0]
-        speed = state[..., 1]
-        measured_m[:, axes] -= path[:, 0].T
-        path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
+        axes_measured_m = np.nan_to_num(measured_m[:, axes].T)[:, None]
+        smoothed_state = system.solve(axes_measured_m, dp[axes, :, 0], dv[axes, :, 0])
+        smoothed_state[:, :, positions.segment_starts] = 0.0
+        path_m = smoothed_state[..., 0]
+        path_velocity_m_s = smoothed_state[..., 1]
+        measured_m[:, axes] -= path_m[:, 0].T
+        path_increment = np.diff(path_m) - positions.length_s * path_velocity_m_s[..., :-1]
         # the same path, of the first time offset, is subtracted for all time offsets
-        for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
+        for array, increment in ((dp, path_increment), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if has_scale:
                 array[axes, :, -1] = increment
@@ -291,7 +304,7 @@ def expected_squares(
     increments = positions.delta_position_m, positions.delta_velocity_m_s
     dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_coefficients) for array in increments)
     square_m2 = np.zeros(len(variance_m2))
-    for axes, system, _ in positions.factorised_systems(sigma_a_m_s2, variance_m2):
+    for axes, system, _ in positions.factorised_equations(sigma_a_m_s2, variance_m2):
         measured_m = positions.measurement_m[:, axes].T
         error_m = measured_m - system.solve(np.nan_to_num(measured_m), dp[axes], dv[axes])[..., 0]
         position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
@@ -321,25 +334,25 @@ def products_by_segment(
         Measurements of the second signals, which have no Δp and Δv.
     """
     first_measured_m, *increments = signals
-    constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
-    results = []
+    constant_signals = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
+    batch_products = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
-        batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
+        batch_signals = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
         # order: first signals, second signals, sensitivities to the constants
         dp, dv = (
-            np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
-                :, None
-            ]
-            for increment, constant_signal in zip(increments, constants, strict=True)
+            np.concatenate(
+                [increment[batch_signals], 0.0 * increment[batch_signals], constant_signal], axis=1
+            )[:, None]
+            for increment, constant_signal in zip(increments, constant_signals, strict=True)
         )
-        measured = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
+        batch_measured_m = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
         first_rows, second_rows, constant_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
+            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch_signals].shape[1]
         )
-        measured[:, 0, first_rows] = first_measured_m[batch]
-        measured[:, 0, second_rows] = measured_m[batch]
+        batch_measured_m[:, 0, first_rows] = first_measured_m[batch_signals]
+        batch_measured_m[:, 0, second_rows] = measured_m[batch_signals]
         all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
-        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
+        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, batch_measured_m).gram[:, 0]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
             positions.constant_sigma**-2.0
         )
@@ -349,8 +362,8 @@ def products_by_segment(
         by_constants = np.einsum(
             "skc,sck->sk", gram[:, first_rows[:, None], constant_rows], constant_coefficients
         )
-        results.append(gram[:, first_rows, second_rows] - by_constants)
-    return np.concatenate(results, axis=1)
+        batch_products.append(gram[:, first_rows, second_rows] - by_constants)
+    return np.concatenate(batch_products, axis=1)
 
 
 @dataclass(frozen=True)
@@ -465,9 +478,9 @@ class BandedSystem:
 
 def factorise(
     length_s: Array,
-    noise: Array,
+    process_noise: Array,
     is_joined: BoolArray,
-    precision: Array,
+    state_precision: Array,
     correlated_noise: tuple[float, float] | None = None,
 ) -> BandedSystem:
     """Factorise the normal equations of the states at the measurements.
@@ -476,11 +489,11 @@ def factorise(
     ----------
     length_s : ndarray, shape (m - 1,)
         Intervals between the states.
-    noise : ndarray, shape (3, m - 1)
+    process_noise : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q of each interval.
     is_joined : ndarray of bool, shape (m - 1,)
         False between segments.
-    precision : ndarray, shape (m, 2)
+    state_precision : ndarray, shape (m, 2)
         See :class:`BandedSystem`; without priors if there is time-correlated noise.
     correlated_noise : (float, float), optional
         See :class:`Positions`.
@@ -490,60 +503,62 @@ def factorise(
     numpy.linalg.LinAlgError
         A segment has too few measurements for a position and a velocity.
     """
-    q00, q01, q11 = noise
-    measured_precision = precision[:, 0]
+    q00, q01, q11 = process_noise
+    measured_precision = state_precision[:, 0]
     min_noise = MIN_NOISE_RATIO**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
     # Q of a single prediction step has rank one. Rounding errors of its determinant must not hide
     # min_noise, which makes Q invertible
-    product = q00 * q11
-    raw_determinant = product - q01**2
+    variance_product = q00 * q11
+    raw_determinant = variance_product - q01**2
     determinant = (
-        np.where(raw_determinant > MIN_DETERMINANT_RATIO * product, raw_determinant, 0.0)
+        np.where(raw_determinant > MIN_DETERMINANT_RATIO * variance_product, raw_determinant, 0.0)
         + min_noise * q11
     )
     inverse_q = np.where(is_joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)
     i00, i01, i11 = inverse_q
-    slope = i00 * length_s
-    cross = slope + i01
+    velocity_weight = i00 * length_s
+    cross_weight = velocity_weight + i01
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
     state_count = 2 if correlated_noise is None else 3
-    columns = np.zeros((len(precision), state_count, state_count + 2))
-    position = columns[:, 0]
-    velocity = columns[:, 1]
-    position[:, 0], velocity[:, 0] = precision.T
-    position[1:, 0] += i00
-    position[1:, 1] = i01
-    velocity[1:, 0] += i11
-    position[:-1, 0] += i00
-    position[:-1, 1] += cross
-    velocity[:-1, 0] += (cross + i01) * length_s + i11
-    position[:-1, state_count] = -i00
-    position[:-1, state_count + 1] = -i01
-    velocity[:-1, state_count - 1] = -cross
-    velocity[:-1, state_count] = -(i01 * length_s + i11)
+    band_columns = np.zeros((len(state_precision), state_count, state_count + 2))
+    position_rows = band_columns[:, 0]
+    velocity_rows = band_columns[:, 1]
+    position_rows[:, 0], velocity_rows[:, 0] = state_precision.T
+    position_rows[1:, 0] += i00
+    position_rows[1:, 1] = i01
+    velocity_rows[1:, 0] += i11
+    position_rows[:-1, 0] += i00
+    position_rows[:-1, 1] += cross_weight
+    velocity_rows[:-1, 0] += (cross_weight + i01) * length_s + i11
+    position_rows[:-1, state_count] = -i00
+    position_rows[:-1, state_count + 1] = -i01
+    velocity_rows[:-1, state_count - 1] = -cross_weight
+    velocity_rows[:-1, state_count] = -(i01 * length_s + i11)
     log_noise = np.sum(np.log(determinant[is_joined]))
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
         rho = np.where(is_joined, np.exp(-length_s / tau_s), 0.0)
         # variance that is added to the time-correlated noise at each time
         correlated_variance = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
-        correlated = columns[:, 2]
-        position[:, 2] = measured_precision
-        correlated[:, 0] = measured_precision + 1.0 / correlated_variance
-        correlated[:-1, 0] += rho**2 / correlated_variance[1:]
-        correlated[:-1, state_count] = -rho / correlated_variance[1:]
+        correlated_rows = band_columns[:, 2]
+        position_rows[:, 2] = measured_precision
+        correlated_rows[:, 0] = measured_precision + 1.0 / correlated_variance
+        correlated_rows[:-1, 0] += rho**2 / correlated_variance[1:]
+        correlated_rows[:-1, state_count] = -rho / correlated_variance[1:]
         log_noise += np.sum(np.log(correlated_variance))
-    bands = columns.reshape(-1, state_count + 2).T
+    bands = band_columns.reshape(-1, state_count + 2).T
     cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
         raise np.linalg.LinAlgError("a segment has too few positions to determine an initial state")
     log_factor = 2.0 * np.sum(np.log(cholesky_factor[0]))
-    log_determinant = log_factor + log_noise - np.sum(np.log(precision[precision > 0.0]))
+    log_determinant = (
+        log_factor + log_noise - np.sum(np.log(state_precision[state_precision > 0.0]))
+    )
     inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(
-        precision,
+        state_precision,
         length_s,
         inverse_q,
         inverse_sqrt_q11,

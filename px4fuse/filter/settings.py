@@ -17,7 +17,7 @@ INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting; a value outside is a typing error."""
+    """Valid range of a numeric setting; a value outside is probably a typo."""
 
     low: float
     high: float

@@ -24,7 +24,7 @@ from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Una
 AISLE = "aisle"
 # Minimum length (s) of a gap in the IMU
 IMU_GAP_S = 0.1
-# An interval between IMU samples longer than this multiple of the median is a gap
+# Minimum length of a gap in the IMU, as multiple of the median sample interval
 IMU_GAP_INTERVALS = 5.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -47,9 +47,9 @@ class Segment:
         """Segment extended to the whole flight."""
         return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
-    def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
+    def cut(self, spans_s: Iterable[Span]) -> tuple[Span, ...]:
         """Return the parts of time spans (s) that are inside the segment."""
-        clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
+        clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans_s)
         return tuple((start, end) for start, end in clipped_spans if end > start)
 
 
@@ -212,11 +212,11 @@ def make_axes(
     axes = []
     for name in axis_names:
         direction, heading, note = _axis_direction(name, track, segment, heading_deg)
-        samples = track.samples
+        track_samples = track.samples
         if name == "down" and track.barometer is not None:
-            samples = track.barometer.reindex(columns=Columns.POSITION)
-        samples = cut_to_segment(samples, segment)
-        projected = weighted_sum(samples, Columns.POSITION, direction)
+            track_samples = track.barometer.reindex(columns=Columns.POSITION)
+        track_samples = cut_to_segment(track_samples, segment)
+        projected = weighted_sum(track_samples, Columns.POSITION, direction)
         is_finite = np.isfinite(projected)
         if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
@@ -225,8 +225,20 @@ def make_axes(
                 f"{source_label} has no position along the axis {name} in the analysed segment."
             )
         projected_acceleration = project_acceleration(acceleration, direction, segment)
-        measurements = samples.index.to_numpy()[is_finite], projected[is_finite]
-        axes.append(Axis(name, direction, heading, note, *measurements, projected_acceleration))
+        measured_times_and_positions = (
+            track_samples.index.to_numpy()[is_finite],
+            projected[is_finite],
+        )
+        axes.append(
+            Axis(
+                name,
+                direction,
+                heading,
+                note,
+                *measured_times_and_positions,
+                projected_acceleration,
+            )
+        )
     if not axes:
         raise MissingDataError(f"{source_label} has no finite position in the analysed segment.")
     return tuple(axes)
@@ -243,11 +255,11 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
 
 def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     """Return the weighted sum of columns; columns with weight zero may be NaN."""
-    total = np.zeros(len(samples))
+    weighted_total = np.zeros(len(samples))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
-            total += weight * samples[column].to_numpy()
-    return total
+            weighted_total += weight * samples[column].to_numpy()
+    return weighted_total
 
 
 def _axis_direction(

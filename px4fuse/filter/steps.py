@@ -10,7 +10,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight.model import Unavailable
 
-# Timestamps with a smaller difference (s) are equal: their resolution is 1 µs
+# Maximum difference (s) of equal timestamps: half of their resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
@@ -57,8 +57,8 @@ def make_timeline(
         raise SettingsError(
             f"Axis {axis.name} has no position after the initial time of KF, {start_s:.2f} s."
         )
-    count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
-    grid_s = start_s + settings.dt_s * np.arange(count)
+    grid_count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
+    grid_s = start_s + settings.dt_s * np.arange(grid_count)
     # a measurement at a time of the DT grid replaces the grid time
     next_index = np.searchsorted(measured_s, grid_s)
     neighbours = np.clip([next_index - 1, next_index], 0, len(measured_s) - 1)
@@ -84,5 +84,5 @@ def make_timeline(
     )
     gap_of_interval = np.bincount(interval_index, weights=gap_s)[interval_index]
     variance_scale = np.maximum(gap_of_interval / settings.dt_s, 1.0)
-    variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
-    return Timeline(time_s, measurement_index, mean_m_s2, variance, float(np.sum(gap_s)))
+    gap_variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
+    return Timeline(time_s, measurement_index, mean_m_s2, gap_variance, float(np.sum(gap_s)))

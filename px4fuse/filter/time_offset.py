@@ -21,7 +21,7 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
-    COARSE_OFFSETS,
+    COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
     MAX_OFFSET_S,
     PreparedMotion,
@@ -35,25 +35,25 @@ from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets at which the likelihood is computed near its maximum
-FINE_OFFSETS = 11
+FINE_OFFSET_COUNT = 11
 # Number of time offsets of the interpolated likelihood curve
-CURVE_OFFSETS = 121
+CURVE_OFFSET_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: wide, because a GNSS delay that is wrong by 0.2 s
 # rotates EKF2's heading by 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
-# The time offset is accepted if the half-width (s) of its 95 % interval is below this limit
+# Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.15
-# Parts of the flight with a larger σ (s) of the time offset are ignored in the test for a change
+# Maximum σ (s) of the time offset of a flight part in the test for a change
 MAX_PART_SIGMA_S = 0.15
-# The time offset changes in flight if the p-value of "constant" is below this limit
-MAX_CHANGE_P = 0.005
+# Maximum p-value of a constant time offset for the result that it changes in flight
+MAX_CHANGE_P_VALUE = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_CHANGE_S = 0.10
-# Minimum time offset, in σ, to be significant: false alarm probability 0.3 %
+# Minimum significant time offset, in σ of its estimate: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
-# Minimum time offset (s) to be significant: a position error of 3 cm at 1 m/s
+# Minimum significant time offset (s): a position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
-# Number of simulations of the IMU noise for the variance of the time offset
+# Number of simulated IMU noise series for the variance of the time offset
 SIMULATION_COUNT = 96
 
 
@@ -117,7 +117,7 @@ class ClockOffset(Record, frozen=True, kw_only=True):
     @property
     def changes(self) -> bool:
         """True if the offset changes in flight, significantly and by at least ``MIN_CHANGE_S``."""
-        if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P:
+        if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S
 
@@ -133,7 +133,7 @@ def estimate_time_offset(
     noises: Noises,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
-    signals: SignalCache | None = None,
+    signal_cache: SignalCache | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate the time offset to add to the timestamps of a position track.
 
@@ -150,22 +150,22 @@ def estimate_time_offset(
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
-    signals : dict, optional
+    signal_cache : dict, optional
         IMU motion that several estimates share.
     """
     # the height of GNSS is not used: it is noisier, and all axes share one SIGMA_Z
-    axes = 2 if track.origin.is_gnss else 3
-    samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
-    samples = samples.dropna(subset=Columns.POSITION[:2])
+    axis_count = 2 if track.origin.is_gnss else 3
+    position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axis_count]]
+    position_samples = position_samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
-        samples = samples[~np.isin(samples.index, outlier_time_s)]
+        position_samples = position_samples[~np.isin(position_samples.index, outlier_time_s)]
     prepared_motion = prepare_motion(
         flight,
-        samples.index.to_numpy(),
-        samples.to_numpy(),
-        directions=np.eye(3)[:axes],
+        position_samples.index.to_numpy(),
+        position_samples.to_numpy(),
+        directions=np.eye(3)[:axis_count],
         dt_s=settings.dt_s,
-        signals=signals,
+        signal_cache=signal_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
     if isinstance(prepared_motion, Unavailable):
@@ -177,41 +177,42 @@ def estimate_time_offset(
     half_width_s = 0.1
     for motion in (coarse_motion, prepared_motion):
         noises = maximise_likelihood(
-            [motion.at(offset_s)], noises, motion.weight, outliers=False
+            [motion.at(offset_s)], noises, motion.weight, fits_outliers=False
         ).noises
-        curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSETS)
+        curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
         fit = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
         offset_s, sigma_s = _minimum_and_sigma(curve_s, fit.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
     variance_factor = _simulate_variance_factor(prepared_motion, offset_s, noises, sigma_s**-2.0)
     while True:
         nodes_s, curve_s = (
-            _offset_grid(offset_s, half_width_s, count) for count in (FINE_OFFSETS, CURVE_OFFSETS)
+            _offset_grid(offset_s, half_width_s, count)
+            for count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
         )
-        batches = prepared_motion.position_batches(nodes_s)
-        totals = fit_noises(batches, noises, prepared_motion.weight).scores()[0]
-        scores = CubicSpline(nodes_s, totals)(curve_s)
-        low_s, high_s = profile_interval(curve_s, scores, PROFILE_DROP * variance_factor)
+        position_batches = prepared_motion.position_batches(nodes_s)
+        node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
+        curve_scores = CubicSpline(nodes_s, node_scores)(curve_s)
+        low_s, high_s = profile_interval(curve_s, curve_scores, PROFILE_DROP * variance_factor)
         is_closed = low_s is not None and high_s is not None
         if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
             break
         half_width_s *= 2.0
-    offset_s = _minimum_and_sigma(curve_s, scores)[0]
+    offset_s = _minimum_and_sigma(curve_s, curve_scores)[0]
     # an IMU sample is a mean, and its timestamp may be anywhere in the averaged interval
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
     low_s = float(offset_s - half_intervals_s[0])
     high_s = float(offset_s + half_intervals_s[1])
-    reason = ""
+    rejection_reason = ""
     if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
-        reason = (
+        rejection_reason = (
             f"time offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: "
             "the flight has too little acceleration, or the positions have too much noise"
         )
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
-    if not reason:
+    if not rejection_reason:
         progress("changes of the time offset in flight")
         parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
@@ -221,10 +222,10 @@ def estimate_time_offset(
         interval_s=(applied_s + low_s, applied_s + high_s),
         applied_s=applied_s,
         sigma_s=float(np.hypot(sigma_s * np.sqrt(variance_factor), resolution_s)),
-        is_determinable=not reason,
-        reason=reason,
+        is_determinable=not rejection_reason,
+        reason=rejection_reason,
         curve_s=applied_s + curve_s,
-        curve_drop=scores - scores.min(),
+        curve_drop=curve_scores - curve_scores.min(),
         parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
@@ -249,67 +250,69 @@ def _simulate_variance_factor(
     covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn is random even at rest,
     because e contains the same noise n.
     """
-    positions = prepared_motion.at(offset_s)
-    is_joined = positions.is_joined
-    count = len(prepared_motion.time_s)
-    axes = len(prepared_motion.directions)
+    offset_positions = prepared_motion.at(offset_s)
+    is_joined = offset_positions.is_joined
+    measurement_count = len(prepared_motion.time_s)
+    axis_count = len(prepared_motion.directions)
     interval_count = int(np.count_nonzero(is_joined))
-    rng = np.random.default_rng(count)
+    rng = np.random.default_rng(measurement_count)
 
     def draw_normal(size: int) -> Array:
-        return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
+        return rng.standard_normal((size, axis_count, SIMULATION_COUNT)).transpose(1, 2, 0)
 
-    q00, q01, q11 = noises.sigma_a_m_s2**2 * positions.noise_unit[:, is_joined]
-    dp, dv = np.zeros((2, axes, SIMULATION_COUNT, count - 1))
+    q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.noise_unit[:, is_joined]
+    dp, dv = np.zeros((2, axis_count, SIMULATION_COUNT, measurement_count - 1))
     dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
     dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
-    error_m = noises.sigma_z_m * draw_normal(count)
+    error_m = noises.sigma_z_m * draw_normal(measurement_count)
     # the velocity noise is the sum of the increments since the start of the segment
     velocity_noise = np.zeros_like(error_m)
-    for begin, end in positions.segments:
+    for begin, end in offset_positions.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
     # the random walk of the source is added after the velocity noise, which contains IMU noise only
     if noises.random_walk_m:
         dp[..., is_joined] += (
             noises.random_walk_m
-            * np.sqrt(positions.length_s[is_joined])
+            * np.sqrt(offset_positions.length_s[is_joined])
             * draw_normal(interval_count)
         )
-    positions, variance = positions.in_sigma_z_units(
+    offset_positions, variance = offset_positions.in_sigma_z_units(
         1.0, noises.random_walk_m, prepared_motion.weight / noises.sigma_z_m**2
     )
-    products = products_by_segment(
-        positions, noises.sigma_a_m_s2, variance, (error_m, dp, dv), velocity_noise
+    noise_products = products_by_segment(
+        offset_positions, noises.sigma_a_m_s2, variance, (error_m, dp, dv), velocity_noise
     )
-    return 1.0 + float(np.var(products.sum(axis=0))) / information
+    return 1.0 + float(np.var(noise_products.sum(axis=0))) / information
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
     """Return the minimum of a profile, found by a parabola, and σ from the curvature."""
-    index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
-    step = grid[1] - grid[0]
-    shift, curvature = parabola_vertex(profile, index)
+    minimum_index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
+    grid_step = grid[1] - grid[0]
+    vertex_shift, curvature = parabola_vertex(profile, minimum_index)
     if curvature <= 0.0:
         return float(grid[int(np.argmin(profile))]), float(grid[-1] - grid[0])
-    return float(grid[index] + np.clip(shift, -1.0, 1.0) * step), float(step / np.sqrt(curvature))
+    return float(grid[minimum_index] + np.clip(vertex_shift, -1.0, 1.0) * grid_step), float(
+        grid_step / np.sqrt(curvature)
+    )
 
 
 def _offset_per_part(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Estimate the time offset of each segment, and the p-value of a constant offset."""
-    coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
+    coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
     coarse_s = coarse_s[np.abs(coarse_s) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
         prepared_motion.position_batches(coarse_s), noises, prepared_motion.weight
     ).scores_by_segment()[0]
-    grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSETS)
-    profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
+    grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSET_COUNT)
+    part_profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
     part_offsets = []
     score_drops = []
     for begin, end, profile in zip(
-        prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
+        prepared_motion.edges, prepared_motion.edges[1:], part_profiles, strict=False
     ):
         part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
         sigma_s *= float(np.sqrt(variance_factor))
@@ -319,19 +322,19 @@ def _offset_per_part(
             score_drops.append(profile - profile.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    ratio = 2.0 * float(np.sum(score_drops, axis=0).min()) / variance_factor
-    return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, ratio))
+    chi_square = 2.0 * float(np.sum(score_drops, axis=0).min()) / variance_factor
+    return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
     """Return the drift of the source's clock and its σ (ppm), from the offsets of the parts."""
     if len(part_offsets) < 3:
         return None, None
-    rows = [
+    weighted_offsets = [
         ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
         for part_offset in part_offsets
     ]
-    time_s, offset_s, sigma_s = np.transpose(rows)
+    time_s, offset_s, sigma_s = np.transpose(weighted_offsets)
     coefficients, covariance = np.polyfit(
         time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
     )

@@ -38,15 +38,15 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Minimum number of positions for an estimate of the noises
+# Minimum number of positions for an estimate of SIGMA_A and SIGMA_Z
 MIN_MEASUREMENTS = 30
-# Maximum fraction of outliers for an estimate of the noises
+# Maximum fraction of outliers for an estimate of SIGMA_A and SIGMA_Z
 MAX_OUTLIER_FRACTION = 0.3
-# Factors on KF's SIGMA_A for the initial values of the fit with biases
+# Factors on KF's SIGMA_A that give the initial values of the noise fit with IMU biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# An estimate nearer than this factor to an end of the search range is replaced by a bound
+# Maximum ratio of a noise estimate to an end of its search range for which it is only a bound
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -150,8 +150,8 @@ def tune(
     names: tuple[str, ...] | None = None,
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
-    drifts: bool = False,
-    signals: SignalCache | None = None,
+    may_drift: bool = False,
+    signal_cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -166,9 +166,9 @@ def tune(
         Called with the name of each axis.
     flight : Flight, optional
         Flight whose IMU data separate biases and tilt from noise.
-    drifts : bool
+    may_drift : bool
         True if the source may drift, as odometry does.
-    signals : dict, optional
+    signal_cache : dict, optional
         IMU motion that several estimates share.
     """
     groups: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
@@ -179,15 +179,19 @@ def tune(
         ):
             groups[HORIZONTAL] = horizontal_axes
     tunings = {}
-    signals = {} if signals is None else signals
-    for name, group in groups.items():
+    signal_cache = {} if signal_cache is None else signal_cache
+    for name, group_axes in groups.items():
         if names is None or name in names:
             progress(name)
             try:
-                tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+                tunings[name] = tune_axes(
+                    name, group_axes, settings, flight, may_drift, signal_cache
+                )
             except np.linalg.LinAlgError as error:  # positions far outside of the track
-                what = f"estimate of the noises ({name})"
-                tunings[name] = Unavailable(what, str(error), "Remove positions far from the path.")
+                failed_analysis = f"estimate of the noises ({name})"
+                tunings[name] = Unavailable(
+                    failed_analysis, str(error), "Remove positions far from the path."
+                )
     return tunings
 
 
@@ -196,35 +200,37 @@ def tune_axes(
     axes: tuple[Axis, ...],
     settings: Settings,
     flight: Flight | None = None,
-    drifts: bool = False,
-    signals: SignalCache | None = None,
+    may_drift: bool = False,
+    signal_cache: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
-    intervals = [preintegrate(axis, settings) for axis in axes]
-    count = len(intervals[0].measurement_m)
-    if count < MIN_MEASUREMENTS:
-        return too_few_measurements(f"estimate of the noises ({name})", count, MIN_MEASUREMENTS)
-    axis_positions = [filter_positions(interval_input) for interval_input in intervals]
+    axis_intervals = [preintegrate(axis, settings) for axis in axes]
+    measurement_count = len(axis_intervals[0].measurement_m)
+    if measurement_count < MIN_MEASUREMENTS:
+        return too_few_measurements(
+            f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
+        )
+    axis_positions = [filter_positions(interval_input) for interval_input in axis_intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
+    kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(measurement_count))
     # fit with biases, tilt and time offset; None without IMU data
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF's fit has no weight for the first measurement, its initial state
-        weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
+        axis_weights = np.concatenate([np.ones(len(measured_m) - measurement_count), kf_fit.weight])
         prepared_motion = prepare_motion(
             flight,
             axes[0].measurement_time_s,
             measured_m,
             directions=np.array([axis.direction for axis in axes]),
             dt_s=settings.dt_s,
-            weight=weight,
-            signals=signals,
+            weight=axis_weights,
+            signal_cache=signal_cache,
         )
         if not isinstance(prepared_motion, Unavailable):
             start_noises = replace(
-                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if drifts else 0.0
+                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
             # a coarse time offset is enough: a finer value hardly changes the noises
             offset_s, start_noises = prepared_motion.search_offset(
@@ -257,13 +263,13 @@ def tune_axes(
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=gain_nats / count,
-        before=_assess_innovations(intervals[0], chosen_noises, is_outlier),
-        after=_assess_innovations(intervals[0], final_noises, is_outlier),
-        outlier_time_s=axes[0].measurement_time_s[-count:][is_outlier],
-        count=count,
+        log_likelihood_gain_per_measurement=gain_nats / measurement_count,
+        before=_assess_innovations(axis_intervals[0], chosen_noises, is_outlier),
+        after=_assess_innovations(axis_intervals[0], final_noises, is_outlier),
+        outlier_time_s=axes[0].measurement_time_s[-measurement_count:][is_outlier],
+        count=measurement_count,
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, intervals, chosen_noises, kf_fit),
+        held_out=_check_held_out(name, axis_intervals, chosen_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
     )
@@ -292,8 +298,10 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
     def score(log_a: float, _: float = 0.0) -> float:
         return fit.score(Noises(float(np.exp(log_a)), sigma_z))
 
-    low, high = np.log(SIGMA_A_SEARCH_M_S2)
-    best_log_a = float(minimize_scalar(score, bounds=(low, high), options={"xatol": 1e-3}).x)
+    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_M_S2)
+    best_log_a = float(
+        minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
+    )
     return _noise_with_interval(score, (best_log_a, 0.0), SIGMA_A_SEARCH_M_S2)
 
 
@@ -325,7 +333,7 @@ def _check_held_out(
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
-            f"held-out check of the noises ({name})",
+            f"held-out test of SIGMA_A and SIGMA_Z ({name})",
             f"half of the segment contains only {half_count} measurements (at least "
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
@@ -334,13 +342,18 @@ def _check_held_out(
         filter_positions(interval_input.first_measurements(half_count))
         for interval_input in intervals
     ]
-    first_fit = maximise_likelihood(first_half, fit.noises, fit.weight[:half_count], outliers=False)
+    first_fit = maximise_likelihood(
+        first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
+    )
     tuned_noises = first_fit.noises
     # -ln p of the second half
-    scores = [
+    second_half_scores = [
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
     ]
-    count = len(fit.weight) - half_count
+    second_half_count = len(fit.weight) - half_count
     return HeldOutCheck(
-        tuned_noises.sigma_a_m_s2, tuned_noises.sigma_z_m, count, (scores[0] - scores[1]) / count
+        tuned_noises.sigma_a_m_s2,
+        tuned_noises.sigma_z_m,
+        second_half_count,
+        (second_half_scores[0] - second_half_scores[1]) / second_half_count,
     )

@@ -1,7 +1,7 @@
 """Findings: faults of a flight that the log shows.
 
-To add a finding: yield it in the function ``detect`` of a module in :data:`DETECTORS`, add title,
-group and meaning to ``catalogue.toml``, and its rates to ``tests/studies/rates.csv``.
+Each module in :data:`DETECTORS` yields findings in its function ``detect``. docs/built.md lists the
+files to change for a new finding.
 """
 
 from collections.abc import Mapping

@@ -10,10 +10,10 @@ from px4fuse.comparison.trials import (
     Statistic,
     Trial,
     can_improve,
-    contradicts_truth,
     explained_fraction,
     improvement,
     is_sufficient,
+    makes_overconfident,
 )
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
@@ -63,7 +63,7 @@ def format_change(analysis: Analysis, cause: Trial) -> str:
 
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
     """Format how much of ln(mean NIS or NEES) a change removes."""
-    if contradicts_truth(cause, statistic):
+    if makes_overconfident(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and is_sufficient(cause, statistic):
         return "all"

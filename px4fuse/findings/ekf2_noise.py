@@ -4,9 +4,9 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
-from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
+from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
 from px4fuse.core.text import format_factor
-from px4fuse.filter.consistency import classify_ratio
+from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
@@ -71,9 +71,9 @@ def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     """Return the re-run with another EKF2 noise, if its innovations become consistent."""
     trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
-        classify_ratio(ratio_before, reference) != "consistent"
-        and classify_ratio(ratio_after, reference) == "consistent"
-        for reference, ratio_before, ratio_after in ratio_pairs(trial)
+        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        and classify_sigma_ratio(ratio_after, reference) == "consistent"
+        for reference, ratio_before, ratio_after in sigma_ratio_changes(trial)
         if reference == "source"
     )
     return trial if is_confirmed else None

@@ -6,7 +6,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, lost_imu_fraction
-from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
+from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
 from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
@@ -70,8 +70,8 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
-    fit, ekf2_bias = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
-    if isinstance(fit, BiasScaleJumpFit) and fit.has_bias:
+    fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
+    if isinstance(fit, SystematicErrors) and fit.has_bias:
         forward_bias, right_bias, bias_m_s2 = fit.forward_bias, fit.right_bias, fit.bias.value
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
@@ -95,7 +95,7 @@ def detect_bias(analysis: Analysis) -> Findings:
     elif ekf2_bias is not None:
         # the fit shows no horizontal bias, so only the vertical bias is reported
         bias_m_s2 = float(
-            np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
+            np.linalg.norm(ekf2_bias[2:] if isinstance(fit, SystematicErrors) else ekf2_bias)
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
             yield warning(

@@ -33,6 +33,8 @@ class CatalogueEntry(Record, frozen=True):
         another cause.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
+    after_wrong_convention : str
+        If the source has wrong axes, unit or clock, the finding is an "effect" or "withdrawn".
     """
 
     title: str
@@ -41,6 +43,7 @@ class CatalogueEntry(Record, frozen=True):
     role: Literal["", "unusable", "misleading", "first", "noise", "recording"] = ""
     verdict: Literal["", "meaningless", "repeated"] = ""
     reruns: frozenset[str] = frozenset()
+    after_wrong_convention: Literal["", "effect", "withdrawn"] = ""
 
 
 # All findings by id; findings of equal severity are listed in this order

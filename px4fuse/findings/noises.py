@@ -19,10 +19,10 @@ from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
     can_improve,
-    contradicts_truth,
     find_cause,
     find_trial,
     find_trials,
+    makes_overconfident,
 )
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
@@ -391,7 +391,7 @@ def _variance_remedy(
     if cause is not None and not is_refuted(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
     reruns = find_trials(analysis.trials, filter_name, result.axis.name)
-    if any(contradicts_truth(rerun, "nis") for rerun in reruns):
+    if any(makes_overconfident(rerun, "nis") for rerun in reruns):
         return KEEP_NOISES_TRUTH
     if axis_tuning is None:
         return UNKNOWN_NOISE

@@ -24,29 +24,6 @@ from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
-# Findings that are removed if the source has wrong axes, units, timestamps or orientation
-FALSE_FINDINGS = (
-    "ekf2_noise_too_small",
-    "ekf2_noise_too_large",
-    "ekf2_gate_too_small",
-    "ekf2_ev_delay_wrong",
-    "ekf2_heading_error",
-    "ekf2_underconfident",
-    "position_file_alignment",
-    "source_drift",
-    "error_exceeds_reported_sigma",
-)
-# Findings that are kept as effects of wrong axes, units, timestamps or orientation of the source
-EFFECT_FINDINGS = (
-    "ekf2_overconfident",
-    "ekf2_rejects_positions",
-    "ekf2_resets",
-    "ekf2_fusion_interrupted",
-    "ekf2_not_fusing",
-    "ekf2_position_invalid",
-    "aid_not_fused",
-    "aid_overconfident",
-)
 # Groups of findings that do not depend on the position source
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
@@ -82,7 +59,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
             item
             for item in findings
             if item in unusable_findings
-            or item.id in EFFECT_FINDINGS
+            or _is_effect(item)
             or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
@@ -95,28 +72,30 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     if not root_findings:
         return [*findings]
     other_findings = [
-        item for item in findings if item not in root_findings and item.id not in FALSE_FINDINGS
+        item
+        for item in findings
+        if item not in root_findings and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
     ]
     if faults.is_ambiguous and not unusable_findings:
         return [
             *root_findings,
-            *(
-                item
-                for item in other_findings
-                if item.id in EFFECT_FINDINGS or item.severity == "note"
-            ),
+            *(item for item in other_findings if _is_effect(item) or item.severity == "note"),
         ]
     effects = [
         replace(item, message=f"{item.title}.", caused_by=root_findings[0].id)
         for item in other_findings
-        if item.id in EFFECT_FINDINGS and item.caused_by is None
+        if _is_effect(item) and item.caused_by is None
     ]
     return [
         root_findings[0],
         *effects,
         *root_findings[1:],
-        *(item for item in other_findings if item.id not in EFFECT_FINDINGS),
+        *(item for item in other_findings if not _is_effect(item)),
     ]
+
+
+def _is_effect(item: Finding) -> bool:
+    return CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
 def _faults(analysis: Comparison) -> Faults:

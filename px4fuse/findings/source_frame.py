@@ -80,7 +80,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         if not _is_drift_refuted(analysis.flight, heading):
             yield _drift_finding(analysis, heading)
         return
-    fit = analysis.bias_scale_jump_fit
+    fit = analysis.systematic_errors
     is_explained_by_bias = (
         not isinstance(fit, Unavailable)
         and analysis.source.orientation is None

@@ -54,7 +54,8 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     if (
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
-        or noise.lag_nats >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
+        or noise.low_pass_gain_nats
+        >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
         return
     low_text, high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))

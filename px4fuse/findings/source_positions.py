@@ -12,7 +12,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
 from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
+from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, SystematicErrors
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -149,7 +149,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # a low pass delays positions: correlated errors without a lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.lag_nats < MIN_LAG_NATS
+        and correlated_noise.low_pass_gain_nats < MIN_LAG_NATS
     ):
         return None
     return low_pass
@@ -176,9 +176,9 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
-    fit = analysis.bias_scale_jump_fit
+    fit = analysis.systematic_errors
     # a change of the time offset also shifts the positions of a moving vehicle
-    if not isinstance(fit, BiasScaleJumpFit) or any(detect_arrival_times(analysis)):
+    if not isinstance(fit, SystematicErrors) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
@@ -345,12 +345,12 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
 
 def detect_scale_error(analysis: Analysis) -> Findings:
     """Detect a scale factor error of the source relative to the IMU."""
-    imu, fit = analysis.flight.imu, analysis.bias_scale_jump_fit
+    imu, fit = analysis.flight.imu, analysis.systematic_errors
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or not isinstance(fit, BiasScaleJumpFit)
+        or not isinstance(fit, SystematicErrors)
         # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
@@ -377,8 +377,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
-    fit = analysis.bias_scale_jump_fit
-    jump_times_s = [jump.time_s for jump in fit.jumps] if isinstance(fit, BiasScaleJumpFit) else []
+    fit = analysis.systematic_errors
+    jump_times_s = [jump.time_s for jump in fit.jumps] if isinstance(fit, SystematicErrors) else []
     outlier_times_s = [
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import max_interval_s
-from px4fuse.comparison.remedy import aid_of, format_settings, is_fused_source
+from px4fuse.comparison.remedy import aid_of, format_settings, is_source_fused
 from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
@@ -194,7 +194,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
     model, truth = analysis.ekf2_model, analysis.flight.truth
     if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
         return ""
-    if not model.agreement.good or not is_fused_source(analysis, model.inputs):
+    if not model.agreement.good or not is_source_fused(analysis, model.inputs):
         return ""
     rmses_m = []
     for replay in (model.flown, *replay_settings(model, [change])):

@@ -79,10 +79,10 @@ ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FRO
 
 
 def find_origin(kind: str, path: str) -> Origin:
-    origins = {(str(origin.kind), str(origin.path)): origin for origin in ORIGINS}
-    if (kind, path) not in origins:
-        raise ValueError(f"ORIGINS has no kind and path {(kind, path)}, only {list(origins)}")
-    return origins[kind, path]
+    for origin in ORIGINS:
+        if (origin.kind, origin.path) == (kind, path):
+            return origin
+    raise ValueError(f"ORIGINS in {__file__} has no kind and path {(kind, path)}")
 
 
 def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:

@@ -18,7 +18,7 @@ from px4fuse.loop.corrections import (
     solve_pose_graphs,
 )
 from px4fuse.loop.model import LANDING_SOURCE, Loop, OdometryNoise, TrueEnd
-from px4fuse.loop.odometry import ClosureWithEnd, build_pose_graph
+from px4fuse.loop.odometry import ClosureAndLanding, build_pose_graph
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
@@ -65,15 +65,15 @@ def analyse(
     trajectory = source.trajectory
     flight = source.flight
     is_assessed = flight is not None and bool(flight.log.is_assessed)
-    zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
+    time_origin_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
     def to_track_time(time_s: float) -> float:
-        return time_s + zero_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
+        return time_s + time_origin_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
 
     request_times = (request.start_s, request.end_s)
     start_s, end_s = (None if time_s is None else to_track_time(time_s) for time_s in request_times)
     segment, rests_at_ends = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
-    truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
+    truth = None if flight is None or trajectory.kind == "truth" else truth_trajectory(flight)
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
     truth_end = None
@@ -86,35 +86,39 @@ def analyse(
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
-    closures_with_end: list[ClosureWithEnd] = [(closure, None) for closure in given_closures]
+    closures_and_landings: list[ClosureAndLanding] = [(closure, None) for closure in given_closures]
     if not isinstance(true_end, Unavailable):
-        closures_with_end.insert(
+        closures_and_landings.insert(
             0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
     spacing_m = request.key_frames_m
     spacing_m = default_key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     frame_indices, distance_m = _choose_key_frames(path, spacing_m)
-    graph, nodes, variance_note = build_pose_graph(path, frame_indices, closures_with_end, noise)
+    graph, nodes, variance_note = build_pose_graph(
+        path, frame_indices, closures_and_landings, noise
+    )
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(truth_end, str):
         notes.append(f"the landing place is not in the ground truth: {truth_end}")
-    gated_closures = gate_closures(graph, closures_with_end)
+    gated_closures = gate_closures(graph, closures_and_landings)
     graph_corrections, gated_closures = solve_pose_graphs(
         path, nodes, graph, gated_closures, progress
     )
-    end_m = path.position_m[-1] - path.position_m[0]
+    end_from_start_m = path.position_m[-1] - path.position_m[0]
     heading_deg = loop_segment.heading_change_deg(path)
-    misclosure_m = true_end if isinstance(true_end, Unavailable) else end_m - true_end.displacement
+    misclosure_m = (
+        true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
+    )
     heading_error_deg = _compute_heading_error(true_end, heading_deg)
     landing_closure = next((c for c in gated_closures if c.source == LANDING_SOURCE), None)
     distance_corrections = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
     references = tuple(track for track in (truth, reference) if track is not None)
-    error_m = error_axes_m = None
+    closure_error_m = closure_error_axes_m = None
     if not isinstance(misclosure_m, Unavailable):
-        error_m = float(np.linalg.norm(misclosure_m))
-        error_axes_m = components_by_axis(path.frame, misclosure_m)
+        closure_error_m = float(np.linalg.norm(misclosure_m))
+        closure_error_axes_m = components_by_axis(path.frame, misclosure_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -126,14 +130,16 @@ def analyse(
         key_frames=len(frame_indices),
         key_frame_spacing_m=spacing_m,
         path_length_m=float(distance_m[-1]),
-        end_from_start_m=components_by_axis(path.frame, end_m),
+        end_from_start_m=components_by_axis(path.frame, end_from_start_m),
         heading_change_deg=heading_deg,
         true_end=true_end,
-        closure_error_m=error_m,
-        closure_percent=None if error_m is None else 100.0 * error_m / float(distance_m[-1]),
-        closure_error_axes_m=error_axes_m,
+        closure_error_m=closure_error_m,
+        closure_percent=None
+        if closure_error_m is None
+        else 100.0 * closure_error_m / float(distance_m[-1]),
+        closure_error_axes_m=closure_error_axes_m,
         heading_error_deg=heading_error_deg,
-        is_absolute_track=flight is not None and _is_absolute(trajectory, flight),
+        is_absolute_track=flight is not None and _is_drift_free(trajectory, flight),
         odometry_noise=noise,
         closures=gated_closures,
         corrections=score_paths(path, distance_corrections | graph_corrections, references),
@@ -186,11 +192,11 @@ def _find_true_end(
     return loop_segment.assume_end_at_takeoff(path)
 
 
-def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
+def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
     """Return True if the positions do not drift: KF or EKF2 with a positioning system."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
-    no_odometry = isinstance(find_odometry(flight), Unavailable)
-    return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
+    has_no_odometry = isinstance(find_odometry(flight), Unavailable)
+    return trajectory.kind in ("ekf2", "kf") and has_vision and has_no_odometry
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
@@ -215,38 +221,38 @@ def _require_in_range(name: str, value: float, min_value: float) -> None:
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
-    (start_s, end_s), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
-    label = f"{path.name}: loop closure {times[0]:.12g},{times[1]:.12g}"
-    if not start_s <= times[0] < times[1] <= end_s:
+    (start_s, end_s), closure_times_s = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
+    closure_text = f"{path.name}: loop closure {closure_times_s[0]:.12g},{closure_times_s[1]:.12g}"
+    if not start_s <= closure_times_s[0] < closure_times_s[1] <= end_s:
         raise TrajectoryError(
-            f"{label}: the times must be in ascending order, between {start_s:.2f} s and "
+            f"{closure_text}: the times must be in ascending order, between {start_s:.2f} s and "
             f"{end_s:.2f} s."
         )
     if not 1e-4 <= closure.sigma_m <= MAX_OPTION_VALUE:
         raise TrajectoryError(
-            f"{label}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
+            f"{closure_text}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
         )
 
 
 def _compute_heading_error(
-    end: TrueEnd | Unavailable, heading_deg: float | None
+    true_end: TrueEnd | Unavailable, heading_change_deg: float | None
 ) -> float | Unavailable:
-    name = "heading error of the loop"
-    if isinstance(end, Unavailable):
-        return end
-    if heading_deg is None:
-        return Unavailable(name, "the trajectory has no orientations", "No action is needed.")
-    if end.heading_change_deg is None:
+    quantity = "heading error of the loop"
+    if isinstance(true_end, Unavailable):
+        return true_end
+    if heading_change_deg is None:
+        return Unavailable(quantity, "the trajectory has no orientations", "No action is needed.")
+    if true_end.heading_change_deg is None:
         return Unavailable(
-            name,
-            f"the final heading differs by {heading_deg:+.0f}° from the initial heading, and the "
-            "true difference is unknown",
+            quantity,
+            f"the final heading differs by {heading_change_deg:+.0f}° from the initial heading, "
+            "and the true difference is unknown",
             "Give the true difference as DEG in --landed-at FORWARD,RIGHT,DEG.",
         )
-    return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
+    return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 
 
-def truth_of(flight: Flight) -> Trajectory | None:
+def truth_trajectory(flight: Flight) -> Trajectory | None:
     """Return the ground truth of a flight as a trajectory, if the log contains it."""
     try:
         return trajectory_of(flight, "truth")
@@ -272,11 +278,11 @@ def analyse_flight_loop(
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
-    inside_m = trajectory.between(segment.start_s, segment.end_s).position_m
+    segment_m = trajectory.between(segment.start_s, segment.end_s).position_m
     extent_m = gap_m = 0.0
-    if len(inside_m):
-        extent_m = float(np.linalg.norm(np.ptp(inside_m, axis=0)))
-        gap_m = float(np.linalg.norm(inside_m[-1] - inside_m[0]))
+    if len(segment_m):
+        extent_m = float(np.linalg.norm(np.ptp(segment_m, axis=0)))
+        gap_m = float(np.linalg.norm(segment_m[-1] - segment_m[0]))
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
         or gap_m > MAX_END_DISTANCE_FRACTION * 2.0 * extent_m

@@ -12,9 +12,9 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
-DOWN = np.array([0.0, 0.0, 1.0])
-# Order and signs of the axes that convert each frame to one with z down, its name, and a note
-_TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
+DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
+# Conversion of each frame to a frame with z down: order and signs of the axes, new frame, and note
+_Z_DOWN_CONVERSIONS: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],
         [1.0, 1.0, -1.0],
@@ -36,10 +36,10 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
 }
 # Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
 # the extent
-SPACING_FRACTION = 0.02
+KEY_FRAME_SPACING_FRACTION = 0.02
 # Minimum and maximum of the default key frame spacing (m)
-MIN_SPACING_M = 0.02
-MAX_SPACING_M = 0.5
+MIN_KEY_FRAME_SPACING_M = 0.02
+MAX_KEY_FRAME_SPACING_M = 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
@@ -47,13 +47,13 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
 
     The camera axes are converted to body axes with the nose in the direction of view.
     """
-    if trajectory.frame not in _TO_Z_DOWN:
+    if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
-    order, sign, frame, note = _TO_Z_DOWN[trajectory.frame]
+    axis_order, axis_signs, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
     variance = trajectory.position_variance_m2
     return replace(
-        _rotate(trajectory, np.diag(sign) @ np.eye(3)[order], frame),
-        position_variance_m2=None if variance is None else variance[:, order],
+        _rotate(trajectory, np.diag(axis_signs) @ np.eye(3)[axis_order], z_down_frame),
+        position_variance_m2=None if variance is None else variance[:, axis_order],
         rotation_variance_rad2=trajectory.rotation_variance_rad2,
         notes=(*trajectory.notes, note),
     )
@@ -61,10 +61,10 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
 
 def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """Convert a result of :func:`to_z_down` back to the original ``frame``."""
-    if frame not in _TO_Z_DOWN or trajectory.frame in _TO_Z_DOWN:
+    if frame not in _Z_DOWN_CONVERSIONS or trajectory.frame in _Z_DOWN_CONVERSIONS:
         return trajectory
-    order, sign, _, _ = _TO_Z_DOWN[frame]
-    return _rotate(trajectory, (np.diag(sign) @ np.eye(3)[order]).T, frame)
+    axis_order, axis_signs, _, _ = _Z_DOWN_CONVERSIONS[frame]
+    return _rotate(trajectory, (np.diag(axis_signs) @ np.eye(3)[axis_order]).T, frame)
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
@@ -80,8 +80,12 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 
 def default_key_frame_spacing_m(position_m: Array) -> float:
     """Return the default key frame spacing (m) of a path, shape (n, d)."""
-    extent = float(np.linalg.norm(np.ptp(position_m, axis=0)))
-    return float(np.clip(SPACING_FRACTION * extent, MIN_SPACING_M, MAX_SPACING_M))
+    extent_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
+    return float(
+        np.clip(
+            KEY_FRAME_SPACING_FRACTION * extent_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M
+        )
+    )
 
 
 def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
@@ -90,17 +94,20 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
     The length along all samples of a noisy track is too large: at 30 Hz each interval adds the
     noise of two positions. Key frames at distances above the noise avoid this error.
     """
-    frame_indices = [0]
-    last_frame_m = position_m[0]
-    for index, position in enumerate(position_m[1:-1], start=1):
-        displacement_m = position - last_frame_m
+    key_frame_indices = [0]
+    last_key_frame_m = position_m[0]
+    for pose_index, position in enumerate(position_m[1:-1], start=1):
+        displacement_m = position - last_key_frame_m
         if displacement_m @ displacement_m >= spacing_m * spacing_m:
-            frame_indices.append(index)
-            last_frame_m = position
-    if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
+            key_frame_indices.append(pose_index)
+            last_key_frame_m = position
+    if (
+        len(key_frame_indices) > 1
+        and np.linalg.norm(position_m[-1] - last_key_frame_m) < spacing_m / 2.0
+    ):
         # too near to the last pose, so the distance between them would be mostly noise
-        frame_indices.pop()
-    return np.array([*frame_indices, len(position_m) - 1])
+        key_frame_indices.pop()
+    return np.array([*key_frame_indices, len(position_m) - 1])
 
 
 def distribute_by_distance(
@@ -125,7 +132,10 @@ def heading_change_rad(rotation: Rotation) -> float:
 
 
 def correct_by_distance(
-    trajectory: Trajectory, cumulative_m: Array, misclosure_m: Array, misclosure_heading_rad: float
+    trajectory: Trajectory,
+    cumulative_distance_m: Array,
+    misclosure_m: Array,
+    misclosure_heading_rad: float,
 ) -> Trajectory:
     """Distribute the closure errors (measured minus true) of position and heading by distance.
 
@@ -133,16 +143,16 @@ def correct_by_distance(
     the distance. The remaining position error is distributed by the compass rule.
     """
     position_m = trajectory.position_m
-    fraction = cumulative_m / cumulative_m[-1]
-    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN))
+    fraction = cumulative_distance_m / cumulative_distance_m[-1]
+    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN_DIRECTION))
     middle_fraction = (fraction[1:] + fraction[:-1]) / 2.0
     middle_rotation = Rotation.from_rotvec(
-        np.outer(-middle_fraction * misclosure_heading_rad, DOWN)
+        np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
     rotated_m = position_m[0] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
     )
-    remaining_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
+    remaining_error_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(
-        distribute_by_distance(rotated_m, remaining_m, cumulative_m), rotation
+        distribute_by_distance(rotated_m, remaining_error_m, cumulative_distance_m), rotation
     )

@@ -12,7 +12,7 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, CorrectionName
-from px4fuse.loop.odometry import ClosureWithEnd
+from px4fuse.loop.odometry import ClosureAndLanding
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate_edges
@@ -20,14 +20,14 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
 from px4fuse.trajectory.model import Trajectory
 
-UNCORRECTED = "uncorrected"
-POSITIONS_ONLY = "positions corrected by distance"
-BY_DISTANCE = "positions and headings corrected by distance"
+UNCORRECTED_LABEL = "uncorrected"
+POSITIONS_CORRECTED_LABEL = "positions corrected by distance"
+HEADINGS_CORRECTED_LABEL = "positions and headings corrected by distance"
 # Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
-    "uncorrected": UNCORRECTED,
-    "by_distance_plain": POSITIONS_ONLY,
-    "by_distance": BY_DISTANCE,
+    "uncorrected": UNCORRECTED_LABEL,
+    "by_distance_plain": POSITIONS_CORRECTED_LABEL,
+    "by_distance": HEADINGS_CORRECTED_LABEL,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
 SINGLE_LOOP_REASON = (
@@ -36,7 +36,7 @@ SINGLE_LOOP_REASON = (
 )
 # Corrected path with the solution of its pose graph (None without a pose graph), or the reason why
 # the corrected path is missing
-Corrected = tuple[Trajectory, Solution | None] | Unavailable
+CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
 
 
 def correct_paths_by_distance(
@@ -44,21 +44,21 @@ def correct_paths_by_distance(
     distance_m: Array,
     misclosure_m: Array | Unavailable,
     heading_error_deg: float | Unavailable,
-    landing: Closure | None,
-) -> dict[CorrectionName, Corrected]:
+    landing_closure: Closure | None,
+) -> dict[CorrectionName, CorrectionOutcome]:
     """Distribute the closure error along the path: over positions only, and also over headings."""
-    if landing is not None and not landing.accepted:
-        misclosure_m = _unavailable_by_gate("correction by distance", landing)
+    if landing_closure is not None and not landing_closure.accepted:
+        misclosure_m = _unavailable_by_gate("correction by distance", landing_closure)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
     positions_only = distribute_by_distance(path.position_m, misclosure_m, distance_m)
     heading_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    with_headings = correct_by_distance(path, distance_m, misclosure_m, heading_rad)
+    corrected_path = correct_by_distance(path, distance_m, misclosure_m, heading_rad)
     return {
         "by_distance_plain": (path.with_positions(positions_only), None),
-        "by_distance": (with_headings, None),
+        "by_distance": (corrected_path, None),
     }
 
 
@@ -73,19 +73,21 @@ def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
 
 
 def gate_closures(
-    graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
+    graph: PoseGraph | Unavailable, closures_and_landings: Sequence[ClosureAndLanding]
 ) -> tuple[Closure, ...]:
     """Test the loop closures, which are the last edges of the graph, against odometry."""
     if isinstance(graph, Unavailable):
         return ()
-    edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
+    closure_edges = np.arange(len(graph.first) - len(closures_and_landings), len(graph.first))
     closures = []
-    for result, (closure, end) in zip(gate_edges(graph, edges), closures_with_end, strict=True):
+    for result, (closure, true_end) in zip(
+        gate_edges(graph, closure_edges), closures_and_landings, strict=True
+    ):
         odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
         closure_fields = structs.asdict(closure) | structs.asdict(result)
         del closure_fields["first"], closure_fields["second"]
-        closure_fields["source"] = "given" if end is None else LANDING_SOURCE
-        true_m = np.zeros(3) if end is None else end.displacement
+        closure_fields["source"] = "given" if true_end is None else LANDING_SOURCE
+        true_m = np.zeros(3) if true_end is None else true_end.displacement
         closures.append(
             Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
         )
@@ -98,12 +100,12 @@ def solve_pose_graphs(
     graph: PoseGraph | Unavailable,
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
-) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
+) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
     """Optimise the pose graph three times: with all closures, with gated closures, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
-    corrections: dict[Any, Corrected] = {}
+    corrections: dict[Any, CorrectionOutcome] = {}
     if not closures and not isinstance(graph, Unavailable):
         graph = Unavailable(
             "pose graph",
@@ -113,9 +115,9 @@ def solve_pose_graphs(
     if isinstance(graph, Unavailable):
         corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
         return corrections, ()
-    edges = np.arange(len(graph.first))
-    is_closure = edges >= len(edges) - len(closures)
-    is_rejected = np.zeros(len(edges), bool)
+    edge_indices = np.arange(len(graph.first))
+    is_closure = edge_indices >= len(edge_indices) - len(closures)
+    is_rejected = np.zeros(len(edge_indices), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
@@ -172,15 +174,15 @@ def _interpolate_corrections(
 
 def score_paths(
     odometry: Trajectory,
-    corrected_paths: Mapping[CorrectionName, Corrected],
+    corrected_paths: Mapping[CorrectionName, CorrectionOutcome],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
     """Compute ATE and RPE of the odometry, and of corrected paths with the same time offset."""
     offset_by_reference: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
-        same_clock = 0.0 if reference.sha256 == path.sha256 else None
-        offset_s = offset_by_reference.get(reference.name, same_clock)
+        default_offset_s = 0.0 if reference.sha256 == path.sha256 else None
+        offset_s = offset_by_reference.get(reference.name, default_offset_s)
         try:
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
@@ -194,9 +196,11 @@ def score_paths(
         name: CorrectionName, path: Trajectory, solution: Solution | None
     ) -> CorrectedPath:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
-        names = ("cost_initial", "cost", "iterations", "converged")
+        solution_field_names = ("cost_initial", "cost", "iterations", "converged")
         solution_fields = (
-            {} if solution is None else {name: getattr(solution, name) for name in names}
+            {}
+            if solution is None
+            else {name: getattr(solution, name) for name in solution_field_names}
         )
         return CorrectedPath(
             name=CORRECTION_LABELS[name],

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.closure import DOWN, heading_change_rad
+from px4fuse.loop.closure import DOWN_DIRECTION, heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
@@ -78,34 +78,43 @@ def choose_loop_segment(
     SettingsError
         The segment is empty.
     """
-    low_s, high_s = span_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
-    rests_at_ends, flight_s = False, None
+    segment_start_s, segment_end_s = track_span_s = (
+        float(trajectory.time_s[0]),
+        float(trajectory.time_s[-1]),
+    )
+    rests_at_ends, flight_span_s = False, None
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
         reason = "the whole track, because the log has no land detector"
     else:
         take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
-        low_s, high_s = max(low_s, take_off_s), min(high_s, landing_s)
+        segment_start_s, segment_end_s = (
+            max(segment_start_s, take_off_s),
+            min(segment_end_s, landing_s),
+        )
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
         if start_s is None and end_s is None:
-            rests_at_ends, flight_s = True, (take_off_s, landing_s)
+            rests_at_ends, flight_span_s = True, (take_off_s, landing_s)
     if start_s is not None or end_s is not None:
-        low_s = low_s if start_s is None else start_s
-        high_s = high_s if end_s is None else end_s
+        segment_start_s = segment_start_s if start_s is None else start_s
+        segment_end_s = segment_end_s if end_s is None else end_s
         reason = "the time span was chosen with --from or --to"
-    if not low_s < high_s:
+    if not segment_start_s < segment_end_s:
         raise SettingsError(
-            f"The track has no poses between {low_s:.12g} s and {high_s:.12g} s; it is "
-            f"from {span_s[0]:.2f} s to {span_s[1]:.2f} s.",
+            f"The track has no poses between {segment_start_s:.12g} s and {segment_end_s:.12g} s; "
+            f"it is from {track_span_s[0]:.2f} s to {track_span_s[1]:.2f} s.",
             "Change --from or --to.",
         )
-    inside_s = max(low_s, span_s[0]), min(high_s, span_s[1])
-    if inside_s != (low_s, high_s) and inside_s[0] < inside_s[1]:
-        reason, (low_s, high_s) = f"{reason}, limited to the times with poses", inside_s
-    return Segment(low_s, high_s, reason, flight_s), rests_at_ends
+    limited_span_s = max(segment_start_s, track_span_s[0]), min(segment_end_s, track_span_s[1])
+    if limited_span_s != (segment_start_s, segment_end_s) and limited_span_s[0] < limited_span_s[1]:
+        reason, (segment_start_s, segment_end_s) = (
+            f"{reason}, limited to the times with poses",
+            limited_span_s,
+        )
+    return Segment(segment_start_s, segment_end_s, reason, flight_span_s), rests_at_ends
 
 
 def heading_change_deg(path: Trajectory) -> float | None:
@@ -141,11 +150,13 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
     forward_m, right_m, heading_change_deg = structs.astuple(landing)
     heading_rad = 0.0
     if path.rotation is not None:
-        nose = path.rotation[0].apply([1.0, 0.0, 0.0])
-        heading_rad = float(np.arctan2(nose[1], nose[0]))
-    ned_displacement_m = Rotation.from_rotvec(heading_rad * DOWN).apply([forward_m, right_m, 0.0])
+        nose_direction = path.rotation[0].apply([1.0, 0.0, 0.0])
+        heading_rad = float(np.arctan2(nose_direction[1], nose_direction[0]))
+    displacement_m = Rotation.from_rotvec(heading_rad * DOWN_DIRECTION).apply(
+        [forward_m, right_m, 0.0]
+    )
     return TrueEnd(
-        displacement_m=components_by_axis(path.frame, ned_displacement_m),
+        displacement_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
@@ -163,23 +174,23 @@ def read_end_from_truth(
         true_path = cut_trajectory(truth, segment, rests_at_ends)
     except TrajectoryError as error:
         return str(error)
-    ned_displacement_m = true_path.position_m[-1] - true_path.position_m[0]
-    change_deg = None
-    landed_m = np.linalg.norm(ned_displacement_m)
+    displacement_m = true_path.position_m[-1] - true_path.position_m[0]
+    true_change_deg = None
+    landing_distance_m = np.linalg.norm(displacement_m)
     if path.rotation is not None and true_path.rotation is not None:
         heading_difference_rad = heading_change_rad(path.rotation[0] * true_path.rotation[0].inv())
-        ned_displacement_m = Rotation.from_rotvec(heading_difference_rad * DOWN).apply(
-            ned_displacement_m
+        displacement_m = Rotation.from_rotvec(heading_difference_rad * DOWN_DIRECTION).apply(
+            displacement_m
         )
-        change_deg = heading_change_deg(true_path)
+        true_change_deg = heading_change_deg(true_path)
     elif path.frame != true_path.frame:
         return "the ground truth cannot be rotated to the odometry frame without orientation"
     return TrueEnd(
-        displacement_m=components_by_axis(path.frame, ned_displacement_m),
-        heading_change_deg=change_deg,
+        displacement_m=components_by_axis(path.frame, displacement_m),
+        heading_change_deg=true_change_deg,
         sigma_m=0.02,
-        sigma_heading_deg=None if change_deg is None else 0.5,
-        source=f"ground truth in the log ({truth.name}): landing {landed_m:.2f} m from the "
-        "take-off place",
+        sigma_heading_deg=None if true_change_deg is None else 0.5,
+        source=f"ground truth in the log ({truth.name}): landing {landing_distance_m:.2f} m from "
+        "the take-off place",
         assumed=False,
     )

@@ -21,7 +21,7 @@ from px4fuse.errors import MissingDataError
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
-from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
 # Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
 CorrectionName = Literal[
@@ -86,16 +86,16 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 class Closure(Record, frozen=True, kw_only=True):
     """Loop closure (two times at the same place), with gate result and robust weight."""
 
-    # Times on the clock of the trajectory
+    # Two times at the same place, on the clock of the trajectory
     time_1_s: float
     time_2_s: float
     # σ of the displacement between the two times, per axis
     sigma_m: NotNegative
-    # "landing" for the closure of take-off and landing, "given" for ``--closure``
+    # "landing" for the closure between take-off and landing, "given" for ``--closure``
     source: str
     # Closure error: displacement from odometry minus true displacement
     distance_m: NotNegative
-    # Gate: squared Mahalanobis distance, degrees of freedom, p-value and decision
+    # Gate: squared Mahalanobis distance, degrees of freedom, p-value, and True for acceptance
     d2: NotNegative
     degrees_of_freedom: Count
     p: Share
@@ -115,7 +115,7 @@ class CorrectedPath(Record, frozen=True, kw_only=True):
     # Largest and RMS displacement of the poses by the correction
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
-    # Fields of the pose graph solution; None for a correction without pose graph
+    # Cost (initial, final), iterations and convergence of the pose graph; None without pose graph
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None
@@ -144,7 +144,7 @@ class Loop(Record, frozen=True, kw_only=True):
     """
 
     track: str
-    kind: Kind
+    kind: TrajectoryKind
     frame: Frame
     start_s: float
     end_s: float
@@ -173,7 +173,7 @@ class Loop(Record, frozen=True, kw_only=True):
 
     @property
     def odometry(self) -> CorrectedPath:
-        """Uncorrected path from take-off to landing, in a frame with z down."""
+        """Odometry from take-off to landing, without correction, in a frame with z down."""
         return self.paths["uncorrected"]
 
     @property

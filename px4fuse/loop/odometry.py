@@ -7,22 +7,22 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Unavailable
-from px4fuse.loop.closure import DOWN, heading_change_rad
+from px4fuse.loop.closure import DOWN_DIRECTION, heading_change_rad
 from px4fuse.loop.model import OdometryNoise, TrueEnd
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum growth of the reported position variance along the path, for using reported variances
+# Minimum ratio of final to initial reported position variance for using the reported variances
 # instead of the default drift
 MIN_VARIANCE_GROWTH = 2.0
-# Minimum variance of an odometry edge as fraction of the default: avoids a division by zero
+# Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
 MIN_VARIANCE_FRACTION = 1e-2
-# Fraction of the path at both ends from which start and end variances are taken
+# Fraction of the poses at each end of the path over which the reported variance is averaged
 END_FRACTION = 0.1
-# Loop closure, and the landing place if it is the closure of take-off and landing
-ClosureWithEnd = tuple[GivenClosure, TrueEnd | None]
+# Loop closure, with the landing place if the closure connects landing and take-off
+ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
 
 def odometry_variances(
@@ -88,30 +88,30 @@ def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
     """
     if variance is None:
         return None
-    end_count = max(1, int(END_FRACTION * len(variance)))
-    start_variance = float(np.median(variance[:end_count].sum(axis=1)))
-    end_variance = float(np.median(variance[-end_count:].sum(axis=1)))
-    if not end_variance > MIN_VARIANCE_GROWTH * start_variance:
+    averaged_count = max(1, int(END_FRACTION * len(variance)))
+    start_variance_sum = float(np.median(variance[:averaged_count].sum(axis=1)))
+    end_variance_sum = float(np.median(variance[-averaged_count:].sum(axis=1)))
+    if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
         return None
     return np.maximum(np.diff(variance[nodes], axis=0), 0.0)
 
 
 def build_pose_graph(
     path: Trajectory,
-    frames: IntArray,
-    closures_with_end: Sequence[ClosureWithEnd],
+    key_frame_indices: IntArray,
+    closures_and_landings: Sequence[ClosureAndLanding],
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
     """Build the pose graph of a path (z down): odometry edges between nodes, then closures.
 
-    ``frames`` are the indices of the key frames.
+    ``key_frame_indices`` are the indices of the key frames.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
     nodes : ndarray of int, shape (k,)
         Indices of the nodes: key frames, and the poses nearest to the times of closures.
-    statement : str
+    variance_note : str
         Sentence on the origin of the variances.
     """
     if path.rotation is None:
@@ -121,53 +121,59 @@ def build_pose_graph(
                 "the trajectory has no orientations",
                 "Use a trajectory with orientations.",
             ),
-            frames,
+            key_frame_indices,
             "",
         )
     closure_times_s = np.array(
-        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_with_end]
+        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_and_landings]
     ).reshape(-1, 2)
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
-    nodes = np.union1d(frames, pose_indices).astype(np.intp)
+    nodes = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
     end_nodes = np.searchsorted(nodes, pose_indices)
     position = path.position_m[nodes]
     rotation = path.rotation[nodes]
-    translation_m2, rotation_rad2, statement = odometry_variances(path, nodes, noise)
+    translation_m2, rotation_rad2, variance_note = odometry_variances(path, nodes, noise)
     steps = np.arange(len(nodes) - 1)
     first_nodes = np.append(steps, end_nodes[:, 0])
-    second = np.append(steps + 1, end_nodes[:, 1])
+    second_nodes = np.append(steps + 1, end_nodes[:, 1])
     information = np.zeros((len(first_nodes), 6, 6))
     diagonal = np.column_stack(
         [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
     )
     information[steps[:, None], range(6), range(6)] = diagonal
     first_inverse = rotation[first_nodes].inv()
-    second_rotation = rotation[second]
-    translation_measured = first_inverse.apply(position[second] - position[first_nodes])
-    for row, (closure, end) in enumerate(closures_with_end, start=len(steps)):
+    second_rotation = rotation[second_nodes]
+    translation_measured = first_inverse.apply(position[second_nodes] - position[first_nodes])
+    for row, (closure, true_end) in enumerate(closures_and_landings, start=len(steps)):
         translation_measured[row] = (
-            0.0 if end is None else first_inverse[row].apply(end.displacement)
+            0.0 if true_end is None else first_inverse[row].apply(true_end.displacement)
         )
         information[row, range(3), range(3)] = closure.sigma_m**-2
-        if end is not None and end.heading_change_deg is not None:
+        if true_end is not None and true_end.heading_change_deg is not None:
             odometry_change_rad = heading_change_rad(
                 second_rotation[row] * rotation[first_nodes[row]].inv()
             )
-            error_rad = float(lie.wrap(np.radians(end.heading_change_deg) - odometry_change_rad))
-            second_rotation[row] = Rotation.from_rotvec(error_rad * DOWN) * second_rotation[row]
-            vertical_direction = second_rotation[row].inv().apply(DOWN)
-            sigma = np.radians(end.sigma_heading_deg or 0.0)
-            information[row, 3:, 3:] = np.outer(vertical_direction, vertical_direction) / sigma**2
+            error_rad = float(
+                lie.wrap(np.radians(true_end.heading_change_deg) - odometry_change_rad)
+            )
+            second_rotation[row] = (
+                Rotation.from_rotvec(error_rad * DOWN_DIRECTION) * second_rotation[row]
+            )
+            vertical_direction = second_rotation[row].inv().apply(DOWN_DIRECTION)
+            heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
+            information[row, 3:, 3:] = (
+                np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
+            )
     graph = PoseGraph(
         dimension=3,
         ids=np.arange(len(nodes)),
         poses=np.column_stack([position, rotation.as_quat()]),
         first=first_nodes,
-        second=second,
+        second=second_nodes,
         measurements=np.column_stack(
             [translation_measured, (first_inverse * second_rotation).as_quat()]
         ),
         information=information,
         initialised="odometry",
     )
-    return graph, nodes, statement
+    return graph, nodes, variance_note

@@ -31,11 +31,11 @@ from px4fuse.readers.ros_bag import is_bag
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
-from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, TrajectoryKind
 
 TrackName = Literal["vio", "ekf2", "kf", "truth"]
 TRACK_NAMES: tuple[TrackName, ...] = get_args(TrackName)
-_HEAD_BYTES = 4096
+_FILE_HEAD_BYTES = 4096
 _G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
@@ -118,47 +118,49 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
 
 def _make_trajectory(
     flight: Flight,
-    track_name: Kind,
-    samples: pd.DataFrame,
+    track_name: TrajectoryKind,
+    position_samples: pd.DataFrame,
     orientation: pd.DataFrame | Unavailable | None,
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
     """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
-    samples = finite_rows(samples, Columns.POSITION)
+    position_samples = finite_rows(position_samples, Columns.POSITION)
     rotation = None
     rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
         orientation_s = orientation.index.to_numpy()
-        covered_samples = samples[
-            (samples.index >= orientation_s[0]) & (samples.index <= orientation_s[-1])
+        covered_samples = position_samples[
+            (position_samples.index >= orientation_s[0])
+            & (position_samples.index <= orientation_s[-1])
         ]
         if len(covered_samples) >= MIN_POSES:
-            samples = covered_samples
+            position_samples = covered_samples
             rotations = Rotation.from_quat(
                 orientation[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
             )
-            rotation = Slerp(orientation_s, rotations)(samples.index.to_numpy())
+            rotation = Slerp(orientation_s, rotations)(position_samples.index.to_numpy())
             reported_variance = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
-                columns = [
-                    np.interp(samples.index, orientation_s, column)
+                variance_columns = [
+                    np.interp(position_samples.index, orientation_s, column)
                     for column in reported_variance.T
                 ]
-                rotation_variance = np.column_stack(columns)
-    if len(samples) < MIN_POSES:
+                rotation_variance = np.column_stack(variance_columns)
+    if len(position_samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{track_name} has {len(samples)} poses; {MIN_POSES} are needed"
+            f"{flight.log.name}:{track_name} has {len(position_samples)} poses; {MIN_POSES} are "
+            "needed"
         )
     return Trajectory(
         name=f"{flight.log.name}:{track_name}",
         kind=track_name,
-        time_s=samples.index.to_numpy(np.float64),
-        position_m=samples[Columns.POSITION].to_numpy(np.float64),
+        time_s=position_samples.index.to_numpy(np.float64),
+        position_m=position_samples[Columns.POSITION].to_numpy(np.float64),
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=_complete_variances(samples, Columns.POSITION_VARIANCE),
+        position_variance_m2=_complete_variances(position_samples, Columns.POSITION_VARIANCE),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.bytes,
@@ -175,7 +177,7 @@ def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | No
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory, and the flight if the trajectory is a track of a flight log."""
+    """Trajectory, with the flight from whose log the trajectory is read; None for a file."""
 
     trajectory: Trajectory
     flight: Flight | None
@@ -195,7 +197,7 @@ def is_g2o(path: Path) -> bool:
     TrajectoryError
         The file cannot be read.
     """
-    head = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
     return decode_text(head) is not None and any(
         line.strip().startswith(_G2O_TAGS) for line in head.splitlines()
     )
@@ -229,7 +231,7 @@ def read_source(
         ``frame`` is given for a flight log.
     """
     path, track_name = split_part(argument)
-    head = b"bag" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):
@@ -248,15 +250,15 @@ def read_source(
     flight = read_log(path, system=system)
     if track_name not in (None, *TRACK_NAMES):
         raise TrajectoryError(
-            f"{display_name(path)}: {track_name!r} is not the name of a track in a log",
+            f"{display_name(path)}: a flight log has no track {track_name!r}",
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
-    chosen_track = track_name or default
-    if chosen_track is None:
+    chosen_track_name = track_name or default
+    if chosen_track_name is None:
         odometry = find_odometry(flight)
-        chosen_track = "vio"
+        chosen_track_name = "vio"
         if isinstance(odometry, Unavailable):
-            chosen_track = "ekf2"
+            chosen_track_name = "ekf2"
             if isinstance(flight.ekf2, Unavailable):
                 raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
-    return LoopSource(trajectory_of(flight, chosen_track), flight)
+    return LoopSource(trajectory_of(flight, chosen_track_name), flight)

@@ -84,8 +84,7 @@ class FrameOfReference:
 
 _TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
-if names := [name for name, layout in LAYOUTS.items() if layout.optional]:
-    raise ValueError(f"mavlink_messages.toml: `optional` in {names}. Move its fields to `columns`.")
+assert not any(row.optional for row in LAYOUTS.values()), "mavlink_messages.toml: use `columns`"
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)

@@ -17,7 +17,7 @@ from px4fuse.errors import LogError, TrajectoryError
 from px4fuse.readers.position_file import PositionRecording, read_position_file
 from px4fuse.readers.recording_table import NO_HEADER
 from px4fuse.readers.ros_bag import is_bag
-from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
 # Maximum deviation of a valid quaternion from norm 1
 MAX_NORM_ERROR = 0.1
@@ -153,7 +153,7 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
 
 def _detect_kind(
     path: Path, comments: str, position: Array, rotation: Rotation | None
-) -> tuple[Kind, str]:
+) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
@@ -168,7 +168,7 @@ def _detect_kind(
     return "unknown", ""
 
 
-def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
+def _detect_frame(kind: TrajectoryKind, position: Array) -> tuple[Frame, str]:
     if kind != "slam":
         return "unknown", ""
     centred_m = position - position.mean(axis=0)
@@ -184,7 +184,7 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     )
 
 
-def _describe_gaps(time: Array, kind: Kind) -> str:
+def _describe_gaps(time: Array, kind: TrajectoryKind) -> str:
     """Return a note on gaps between poses or an irregular pose rate, else an empty text."""
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))

@@ -64,7 +64,7 @@ from px4fuse.trajectory.rotation import (
 
 # EKF2's prediction step (µs): EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
-# Initial σ (gauss) per axis of earth field and magnetometer bias, after alignment on the ground
+# σ (gauss) per axis of earth field and magnetometer bias at the start of the log
 FIELD_SIGMA_GAUSS = 0.03
 # Rules of EKF2 v1.14 and later for external vision (ev_control.cpp, common.h)
 VISION_RULES = FusionRules(
@@ -102,7 +102,7 @@ REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) between the variances that the model computes for estimator_states
+# Maximum interval (s) between two variances of estimator_states that the EKF2 model computes
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -157,7 +157,7 @@ def simulate_ekf2(
         magnetometer, barometer = other_sensors
         segment = replace(segment, heights=_barometer_heights(segment, barometer))
         if not logged_values[MAG.switch]:
-            segment = _with_field(segment, magnetometer)
+            segment = _with_field_states(segment, magnetometer)
     settings = effective_settings(logged_values, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     step_s = float(np.median(segment.step_s))
@@ -201,8 +201,8 @@ def _make_segment(
     )
     step_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_us * 1e-6
-    rotation = attitude(motion.at(time_s)).body_to_ned
-    true_quaternions = sensors.quaternions(rotation)
+    body_to_ned = attitude(motion.at(time_s)).body_to_ned
+    true_quaternions = sensors.quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_vector(rotation_rad)])
     )
@@ -211,9 +211,9 @@ def _make_segment(
     attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
         :, HEADING
     ]
-    mean_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_BEFORE_LOG_S)
+    mean_imu_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_BEFORE_LOG_S)
     state, covariance = _initial_state_at_rest(
-        rotation[0], *mean_at_rest, float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], *mean_imu_at_rest, float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
@@ -221,7 +221,7 @@ def _make_segment(
         ReplaySegment(
             time_s=time_s,
             step_s=np.diff(time_s),
-            body_to_ned=rotation,
+            body_to_ned=body_to_ned,
             correction_rad=to_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
@@ -236,7 +236,7 @@ def _make_segment(
             ),
             down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
-            correlation=covariance / sigma[:, None] / sigma,
+            state_correlation=covariance / sigma[:, None] / sigma,
             fusing=False,
         ),
         step_us,
@@ -244,11 +244,11 @@ def _make_segment(
     )
 
 
-def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
+def _with_field_states(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
     """Add earth field and magnetometer bias to the states of the EKF2 model."""
     measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     field_gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
-    # EKF2 has aligned these states on the ground
+    # EKF2 initialises earth field and magnetometer bias on the ground
     state_gauss = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
     return add_field_states(
         segment, measured_at_s, field_gauss, 1.0, state_gauss, np.full(6, FIELD_SIGMA_GAUSS**2)
@@ -326,7 +326,7 @@ def _make_topic_track(
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(model_run, 0)
-    resets, is_aided = _hold_without_aiding(model_run, state)
+    resets, is_step_aided = _hold_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_m in resets:
         reset_sum_m[step:, :2] += reset_m
@@ -353,7 +353,7 @@ def _make_topic_track(
         position_m=position,
         attitude=multiply(from_vector(attitude_error), true_quaternions),
         resets=tuple((step + lag_steps, reset_m) for step, reset_m in resets),
-        is_aided=is_aided,
+        is_step_aided=is_step_aided,
     )
 
 
@@ -369,9 +369,9 @@ def _hold_without_aiding(
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
     last_aid_s = np.zeros(len(time))
     last_aid_s[events.end_step[aid_events]] = time[events.end_step[aid_events]]
-    is_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
-    aiding_ends = np.flatnonzero(np.diff(is_aided.astype(int)) == -1) + 1
-    aiding_starts = np.flatnonzero(np.diff(is_aided.astype(int)) == 1) + 1
+    is_step_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
+    aiding_ends = np.flatnonzero(np.diff(is_step_aided.astype(int)) == -1) + 1
+    aiding_starts = np.flatnonzero(np.diff(is_step_aided.astype(int)) == 1) + 1
     for start, end in zip(
         aiding_ends, [*aiding_starts, len(time)][: len(aiding_ends)], strict=True
     ):
@@ -381,7 +381,7 @@ def _hold_without_aiding(
     for event in np.flatnonzero(model_run.reset[:, 0]):
         step = int(events.end_step[event])
         reset_m = model_run.innovation[event, 0, POSITION_COLUMNS]
-        if not is_aided[step - 1]:
+        if not is_step_aided[step - 1]:
             reset_m = state[step, horizontal] - state[step - 1, horizontal]
         resets.append((step, reset_m))
-    return resets, is_aided
+    return resets, is_step_aided

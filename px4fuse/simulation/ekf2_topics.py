@@ -19,8 +19,8 @@ from px4fuse.simulation.ulog_writer import Topic, topic
 # Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
 # simulation (SITL) logs all messages
 VEHICLE_AID_SOURCE_HZ = 2.0
-# Logging rates (Hz) of estimator_states, vehicle_local_position and estimator_status_flags on a
-# vehicle (PX4 v1.16, logged_topics.cpp)
+# Logging rates (Hz) of EKF2 topics and vehicle_magnetometer on a vehicle (PX4 v1.16,
+# logged_topics.cpp)
 STATES_HZ = 2.0
 LOCAL_POSITION_HZ = 10.0
 FLAGS_HZ = 1.0
@@ -46,7 +46,7 @@ class TopicTrack:
         State that the output predictor publishes.
     resets : tuple of (int, ndarray)
         Step and size (m, north and east) of each reset of the published position.
-    is_aided : ndarray of bool
+    is_step_aided : ndarray of bool
         True at steps with an aiding source that was fused within NO_AID_TIMEOUT_S.
     """
 
@@ -58,7 +58,7 @@ class TopicTrack:
     position_m: Array
     attitude: Array
     resets: tuple[tuple[int, Array], ...]
-    is_aided: BoolArray
+    is_step_aided: BoolArray
 
     def timestamps(self, steps: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
         """Return the timestamps of messages that EKF2 publishes after the prediction ``steps``.
@@ -93,7 +93,7 @@ def ekf2_topics(
     topics = (
         _local_position_topic(track, is_gnss=inputs.aid == GNSS_POS),
         _states_topic(model_run, track, is_gnss=inputs.aid == GNSS_POS),
-        *_aid_sources(inputs, model_run, track, aid_source_hz),
+        *_position_aid_topics(inputs, model_run, track, aid_source_hz),
         *_barometer_topics(inputs, model_run, track),
         *_magnetometer_topics(inputs, model_run, track, attitude_hz),
         _flags_topic(inputs, model_run, track),
@@ -108,9 +108,9 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
     reset_count = np.searchsorted(steps, rows, side="right")
     fields = sensors.timestamps(track.time_us[rows], PUBLICATION_DELAY_US)
     fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
-    is_aided = track.is_aided[np.maximum(rows - track.lag_steps, 0)]
+    is_step_aided = track.is_step_aided[np.maximum(rows - track.lag_steps, 0)]
     fields |= {"delta_xy": resets_m[reset_count], "xy_reset_counter": reset_count % 256}
-    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_aided)
+    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
     if is_gnss:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
     return topic("vehicle_local_position", fields)
@@ -134,7 +134,7 @@ def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) ->
     return topic("estimator_states", fields)
 
 
-def _aid_sources(
+def _position_aid_topics(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
@@ -145,7 +145,7 @@ def _aid_sources(
     measured_m = received.position_m[sample_indices, :2]
     north, east = measured_m.T
     innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
-    innovation, variance, noise = (
+    innovation, innovation_variance, noise_variance = (
         values[event_rows, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
     is_not_tested = np.isnan(innovation[:, :1])
@@ -153,8 +153,10 @@ def _aid_sources(
     innovation = np.where(
         is_not_tested, measured_m - track.delayed_states[steps][:, POSITION][:, :2], innovation
     )
-    variance = np.where(
-        is_not_tested, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance
+    innovation_variance = np.where(
+        is_not_tested,
+        run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise_variance,
+        innovation_variance,
     )
     fused_us = np.where(
         run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[steps], -1
@@ -163,12 +165,12 @@ def _aid_sources(
     last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
     is_gnss = received.velocity_m_s is not None
     observed = unproject(north, east, sensors.HOME_POSITION[:2]) if is_gnss else (north, east)
-    position_topic = _aid_source(
+    position_topic = _aid_source_topic(
         inputs.aid,
         inputs.settings,
         timestamps | {"time_last_fuse": last_fused_us},
         np.stack(observed, axis=1),
-        (innovation, variance, noise),
+        (innovation, innovation_variance, noise_variance),
         (run.rejected[event_rows, 0], run.fused[event_rows, 0]),
     )
     if received.velocity_m_s is None:
@@ -180,7 +182,7 @@ def _aid_sources(
         velocity_innovation**2 > inputs.settings[GNSS_VEL.gate] ** 2 * velocity_innovation_variance,
         axis=1,
     )
-    return position_topic, _aid_source(
+    return position_topic, _aid_source_topic(
         GNSS_VEL,
         inputs.settings,
         timestamps,
@@ -201,19 +203,19 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
     ].iloc[1:]
     update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, variance, is_rejected, is_fused, rows = update_rows.to_numpy().T
-    measured_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
+    measured_s, steps = update_rows.index.to_numpy(), rows.astype(np.intp)
     measured_m = (
         heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)]
         - sensors.HOME_POSITION[2]
     )
-    noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
+    noise_variance = np.full(len(steps), inputs.settings[BAROMETER.noise] ** 2)
     return [
-        _aid_source(
+        _aid_source_topic(
             BAROMETER,
             inputs.settings,
-            track.timestamps(step, measured_s),
+            track.timestamps(steps, measured_s),
             measured_m,
-            (innovation, variance, noise),
+            (innovation, variance, noise_variance),
             (is_rejected > 0, is_fused > 0),
         )
     ]
@@ -230,10 +232,10 @@ def _magnetometer_topics(
     has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
     event_rows = track.logged_events(has_sample, end_step, OTHER_AIDS_HZ)
     rows = end_step[event_rows]
-    innovation, variance, fused = np.moveaxis(model_run.field[event_rows, :, 0], 1, 0)
-    observation = field.value[np.searchsorted(field.step, rows, side="right") - 1]
-    noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
-    is_fused = fused[:, 0] > 0.0
+    innovation, variance, fused_fraction = np.moveaxis(model_run.field[event_rows, :, 0], 1, 0)
+    observed_gauss = field.value[np.searchsorted(field.step, rows, side="right") - 1]
+    noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
+    is_fused = fused_fraction[:, 0] > 0.0
     published_rows = np.flatnonzero(
         sensors.keep_at_rate(sensors.seconds(track.time_us), attitude_hz)
     )
@@ -247,12 +249,12 @@ def _magnetometer_topics(
             PUBLICATION_DELAY_US,
             track.attitude[published_rows],
         ),
-        _aid_source(
+        _aid_source_topic(
             MAG,
             settings,
             track.timestamps(rows),
-            observation,
-            (innovation, variance, noise),
+            observed_gauss,
+            (innovation, variance, noise_variance),
             (~is_fused, is_fused),
         ),
         topic(
@@ -262,7 +264,7 @@ def _magnetometer_topics(
     ]
 
 
-def _aid_source(
+def _aid_source_topic(
     aid: Aid,
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
@@ -275,15 +277,15 @@ def _aid_source(
     ``innovation_values`` are innovation, its variance S, and the measurement variance R.
     ``decisions`` are masks of rejected and of fused samples.
     """
-    innovation, variance, noise_variance = innovation_values
-    ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
+    innovation, innovation_variance, noise_variance = innovation_values
+    test_ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance)
     fields = {
         **timestamps,
         "observation": observation,
         "observation_variance": noise_variance,
         "innovation": -innovation,
-        "innovation_variance": variance,
-        "test_ratio": ratio,
+        "innovation_variance": innovation_variance,
+        "test_ratio": test_ratio,
         "innovation_rejected": decisions[0],
         "fused": decisions[1],
     }
@@ -293,16 +295,18 @@ def _aid_source(
 
 def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:
     """Make estimator_status_flags: once a second, and when fusion starts or stops."""
-    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
-    attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
-    is_fusing = np.zeros(len(time), np.bool_)
-    stops = np.append(time[events.end_step[attempts]], np.inf)[1:]
-    for step, stop in zip(events.end_step[attempts].tolist(), stops.tolist(), strict=True):
-        stop_s = time[step] + inputs.rules.stop_s
-        is_fusing[step : int(np.searchsorted(time, min(stop, stop_s)))] = True
+    events, run, time_s = model_run.events[0], model_run, model_run.segment.time_s
+    fusion_attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
+    is_fusing = np.zeros(len(time_s), np.bool_)
+    next_attempts_s = np.append(time_s[events.end_step[fusion_attempts]], np.inf)[1:]
+    for step, next_attempt_s in zip(
+        events.end_step[fusion_attempts].tolist(), next_attempts_s.tolist(), strict=True
+    ):
+        stop_s = time_s[step] + inputs.rules.stop_s
+        is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
-    is_logged = has_changed | sensors.keep_at_rate(time, FLAGS_HZ)
-    rows = np.flatnonzero(is_logged[: len(time) - track.lag_steps])
+    is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_HZ)
+    rows = np.flatnonzero(is_logged[: len(time_s) - track.lag_steps])
     is_gnss = inputs.aid == GNSS_POS
     fields = track.timestamps(rows) | {
         "control_status_changes": np.cumsum(has_changed)[rows],

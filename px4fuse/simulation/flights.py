@@ -15,21 +15,21 @@ from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import ASSESSED_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
-from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake
+from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistake_names, format_mistake
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 NO_MISTAKES = Mistakes()
-# Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity
+# Values of the PX4 parameters with which EKF2 fuses positions (GNSS: and velocities)
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
 PROFILE_WITH_VISION = 129
 # SDLOG_PROFILE that does not log the topics of external vision
-PROFILE_DEFAULT = 1
+PROFILE_WITHOUT_VISION = 1
 # Version number of PX4 v1.16.0, the release whose topics are simulated
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
-HARDWARE = "px4fuse simulation"
+SIMULATION_HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
@@ -53,7 +53,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     SettingsError
         An injected fault is not possible in this scenario.
     """
-    for name in active_mistakes(mistakes):
+    for name in active_mistake_names(mistakes):
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].changes_ekf2 and not scenario.ekf2:
@@ -95,8 +95,8 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         ekf2_topics = ekf2.simulate_ekf2(
             scenario, mistakes, motion, imu, positions, other_sensors, parameters
         )
-        names = {topic.name for topic in ekf2_topics}
-        topics = [*(topic for topic in topics if topic.name not in names), *ekf2_topics]
+        ekf2_topic_names = {topic.name for topic in ekf2_topics}
+        topics = [*(topic for topic in topics if topic.name not in ekf2_topic_names), *ekf2_topics]
     if scenario.truth:
         topics.append(sensors.true_attitude(scenario, motion))
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
@@ -113,7 +113,7 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",
-        "ver_hw": HARDWARE,
+        "ver_hw": SIMULATION_HARDWARE,
         "ver_sw_release": PX4_RELEASE,
         **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
         **({ASSESSED_KEY: 1} if is_assessed else {}),
@@ -134,7 +134,7 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
         **dict.fromkeys(FUSION_ON_VALUES, 0),
         scenario.aid.switch: switch_value,
         "EKF2_HGT_REF": 0,
-        "SDLOG_PROFILE": PROFILE_DEFAULT
+        "SDLOG_PROFILE": PROFILE_WITHOUT_VISION
         if mistakes.no_vvo or scenario.aid == GNSS_POS
         else PROFILE_WITH_VISION,
     }
@@ -157,9 +157,9 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                     "typed": format_mistake(name, mistakes),
                     "help": MISTAKES[name].help,
                     "finding": MISTAKES[name].finding,
-                    **{field: getattr(mistakes, field) for field in MISTAKES[name].sizes},
+                    **{field: getattr(mistakes, field) for field in MISTAKES[name].size_fields},
                 }
-                for name in active_mistakes(mistakes)
+                for name in active_mistake_names(mistakes)
             },
             "truth": {
                 "duration_s": motion.duration_s,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from px4fuse.core.record import table
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
+from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bounds_by_field
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Mistakes:
     ekf2_off: bool = False
 
 
-QUANTITIES = quantities(Mistakes)
+BOUNDS_BY_FIELD = bounds_by_field(Mistakes)
 # ASCII spelling of units, for sizes of injected faults on the command line
 _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
@@ -78,20 +78,22 @@ class Mistake:
     default: float | bool
     help: str
     finding: str
-    kinds: tuple[Kind, ...] = KINDS
+    kinds: tuple[ScenarioKind, ...] = KINDS
     changes_ekf2: bool = False
     fields: tuple[str, ...] = ()
 
     @property
-    def sizes(self) -> tuple[str, ...]:
+    def size_fields(self) -> tuple[str, ...]:
         """Fields that are sizes or times; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
-        required, *optional = [f"={QUANTITIES[name].cli_name}" for name in self.sizes] or [""]
-        return required + "".join(f"[,{name[1:]}]" for name in optional)
+        required, *optional = [
+            f"={BOUNDS_BY_FIELD[placeholder].cli_name}" for placeholder in self.size_fields
+        ] or [""]
+        return required + "".join(f"[,{placeholder[1:]}]" for placeholder in optional)
 
 
 MISTAKES: Mapping[str, Mistake] = {
@@ -106,10 +108,10 @@ MISTAKES: Mapping[str, Mistake] = {
 }
 
 
-def parse(texts: Iterable[str]) -> Mistakes:
+def parse_mistakes(texts: Iterable[str]) -> Mistakes:
     """Parse injected faults from the command line.
 
-    >>> parse(["clock-offset=80ms", "nlos=5%,3m"]).clock_offset_s
+    >>> parse_mistakes(["clock-offset=80ms", "nlos=5%,3m"]).clock_offset_s
     0.08
 
     Parameters
@@ -123,33 +125,36 @@ def parse(texts: Iterable[str]) -> Mistakes:
         Unknown name, or a value that is not a number, has an unknown unit or is out of range.
     """
     value_by_field: dict[str, float] = {}
-    for text in texts:
-        name, separator, values = text.strip().partition("=")
+    for option_text in texts:
+        name, separator, values_text = option_text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: px4fuse cannot inject the fault {name}",
+                f"--mistake {option_text}: px4fuse cannot inject the fault {name}",
                 f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
-        typed_values = values.split(",") if separator else []
-        if len(typed_values) > len(mistake.sizes):
+        typed_values = values_text.split(",") if separator else []
+        if len(typed_values) > len(mistake.size_fields):
             raise SettingsError(
-                f"--mistake {text} has too many values: give {name}{mistake.usage}."
+                f"--mistake {option_text} has too many values: give {name}{mistake.usage}."
             )
         value_by_field[mistake.fields[0]] = mistake.default
-        for field, value in zip(mistake.sizes, typed_values, strict=False):
-            bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
-            if size is None:
+        for field, value in zip(mistake.size_fields, typed_values, strict=False):
+            bounds, typed_size = (
+                BOUNDS_BY_FIELD[field],
+                convert_to_unit(value, BOUNDS_BY_FIELD[field].unit),
+            )
+            if typed_size is None:
                 raise SettingsError(
-                    f"--mistake {text}: {value!r} is not a valid value: give "
+                    f"--mistake {option_text}: {value!r} is not a valid value: give "
                     f"{UNIT_NAMES[bounds.unit]}, as in {name}{mistake.usage}."
                 )
-            bounds.check(size, f"--mistake {text}: {bounds.cli_name}")
-            value_by_field[field] = size
+            bounds.check(typed_size, f"--mistake {option_text}: {bounds.cli_name}")
+            value_by_field[field] = typed_size
     return Mistakes(**value_by_field)  # type: ignore[arg-type]
 
 
-def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
+def active_mistake_names(mistakes: Mistakes) -> tuple[str, ...]:
     """Return the names of the faults with a size that is not the default."""
     defaults = Mistakes()
     return tuple(
@@ -162,12 +167,12 @@ def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
 def format_mistake(name: str, mistakes: Mistakes) -> str:
     """Format one injected fault with its values, in the notation of the option --mistake.
 
-    >>> format_mistake("nlos", parse(["nlos=5"]))
+    >>> format_mistake("nlos", parse_mistakes(["nlos=5"]))
     'nlos=5%,2m'
     """
-    values = [
-        f"{value:g}{_ASCII_UNITS.get(unit := QUANTITIES[field].unit, unit)}"
-        for field in MISTAKES[name].sizes
+    value_texts = [
+        f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field].unit, unit)}"
+        for field in MISTAKES[name].size_fields
         if (value := getattr(mistakes, field)) is not None
     ]
-    return f"{name}={','.join(values)}" if values else name
+    return f"{name}={','.join(value_texts)}" if value_texts else name

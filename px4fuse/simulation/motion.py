@@ -23,14 +23,14 @@ from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenari
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0
 # Maximum climb and descent rate (m/s)
-CLIMB_M_S = 0.75
+MAX_CLIMB_RATE_M_S = 0.75
 # Duration (s) of each change of the climb rate
 CLIMB_RAMP_S = 1.5
 # Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
-# Time (s) in which the slow deviation from the path grows after take-off and decreases before
-# landing
-FADE_S = 3.0
+# Time (s) in which the slow deviation from the path increases to its full size after take-off, and
+# decreases to zero before landing
+DEVIATION_FADE_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
 # Minimum time (s) between two velocity or yaw ramps: a ramp that starts earlier continues the
@@ -42,15 +42,15 @@ DEVIATION_PERIODS_S = (3.0, 20.0)
 SINE_COUNT = 4
 
 
-def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
+def _sum_of_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     """Return a function of time that changes in quintic ramps, and is constant between them.
 
     ``ramps`` are tuples of start (s), duration (s) and change. Before the first ramp, the function
     is zero.
     """
-    start_s, length_s, change = (np.array(values) for values in zip(*ramps, strict=True))
+    start_s, duration_s, change = (np.array(values) for values in zip(*ramps, strict=True))
     value_after = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
-    end_s = start_s + length_s
+    end_s = start_s + duration_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
     # a ramp that starts at the end of the previous ramp continues it
     is_used = np.diff(times_s, prepend=-np.inf) > MIN_RAMP_DISTANCE_S
@@ -60,7 +60,7 @@ def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a result of :func:`_ramps`, shape (t, k); order -1 is the integral."""
+    """Return derivatives of a :func:`_sum_of_ramps`, shape (t, k); order -1 is the integral."""
     inside_s = np.clip(time_s, *function.x[[0, -1]])
     return [np.asarray(function.derivative(order)(inside_s)) for order in orders]
 
@@ -126,10 +126,10 @@ class Motion:
         position, velocity, acceleration, jerk = _derivatives(self.velocity, time_s, (-1, 0, 1, 2))
         yaw, yaw_rate = _derivatives(self.yaw, time_s, (0, 1))
         # the deviation is multiplied by a factor that is 1 in the air and 0 on the ground
-        fade = _ramps(
+        fade = _sum_of_ramps(
             [
-                (self.take_off_s, FADE_S, np.array([1.0])),
-                (self.touch_down_s - FADE_S, FADE_S, np.array([-1.0])),
+                (self.take_off_s, DEVIATION_FADE_S, np.array([1.0])),
+                (self.touch_down_s - DEVIATION_FADE_S, DEVIATION_FADE_S, np.array([-1.0])),
             ]
         )
         # derivatives of the product fade · deviation (Leibniz rule)
@@ -165,11 +165,13 @@ class Attitude:
 
 
 def attitude(state: State) -> Attitude:
-    """Return the attitude in which the thrust causes the true acceleration, and the rates."""
+    """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
-    thrust_opposite = gravity - state.acceleration_m_s2
-    thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite, thrust_opposite))[:, None]
-    z = thrust_opposite / thrust_m_s2
+    thrust_opposite_m_s2 = gravity - state.acceleration_m_s2
+    thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite_m_s2, thrust_opposite_m_s2))[
+        :, None
+    ]
+    z = thrust_opposite_m_s2 / thrust_m_s2
     z_rate = -state.jerk_m_s3 / thrust_m_s2
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
     c, s = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
@@ -179,21 +181,21 @@ def attitude(state: State) -> Attitude:
     ux, uy, uz = z_rate.T
     n_rate = np.stack([-uz * s, uz * c, ux * s - uy * c], axis=1)
     n_rate += state.yaw_rate_rad_s[:, None] * np.stack([-zz * c, -zz * s, zx * c + zy * s], axis=1)
-    n_size = np.sqrt(np.einsum("ij,ij->i", n, n))
-    y = n / n_size[:, None]
+    n_length = np.sqrt(np.einsum("ij,ij->i", n, n))
+    y = n / n_length[:, None]
     x = np.cross(y, z)
     # angular rate ω in body axes, from dR/dt = R [ω]×
-    rate = np.stack(
+    rate_rad_s = np.stack(
         [
             -np.einsum("ij,ij->i", z_rate, y),
             np.einsum("ij,ij->i", z_rate, x),
-            -np.einsum("ij,ij->i", n_rate, x) / n_size,
+            -np.einsum("ij,ij->i", n_rate, x) / n_length,
         ],
         axis=1,
     )
-    force = np.zeros_like(z)
-    force[:, 2] = -thrust_m_s2[:, 0]
-    return Attitude(np.stack([x, y, z], axis=2), rate, force)
+    force_m_s2 = np.zeros_like(z)
+    force_m_s2[:, 2] = -thrust_m_s2[:, 0]
+    return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
 def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
@@ -204,27 +206,29 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     SettingsError
         The open end of the loop is longer than its last side, or the flight takes too long.
     """
-    flight_plan = _Plan(TIME_ON_GROUND_S, scenario.heading_deg)
-    climb_m_s = min(CLIMB_M_S, scenario.altitude_m / 2.0)
-    rise_s = scenario.altitude_m / climb_m_s
-    up = np.array([0.0, 0.0, -climb_m_s])
-    flight_plan.add_velocity_change(up, CLIMB_RAMP_S, rise_s)
-    flight_plan.add_velocity_change(-up, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s)
+    flight_plan = _FlightPlan(TIME_ON_GROUND_S, scenario.heading_deg)
+    climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
+    climb_time_s = scenario.altitude_m / climb_rate_m_s
+    climb_velocity_m_s = np.array([0.0, 0.0, -climb_rate_m_s])
+    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
+    flight_plan.add_velocity_change(
+        -climb_velocity_m_s, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s
+    )
     if scenario.kind == "aisle":
         _fly_aisle(flight_plan, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
     else:
         _fly_loop(flight_plan, scenario, mistakes)
-    flight_plan.add_velocity_change(-up, CLIMB_RAMP_S, rise_s)
-    touch_down_s = flight_plan.centre_s + CLIMB_RAMP_S / 2.0
+    flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
+    touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
         raise SettingsError(
             f"This flight would take {touch_down_s:.0f} s; the simulation is limited to "
             f"{MAX_FLIGHT_S:g} s. Reduce --passes or --length."
         )
-    flight_plan.add_velocity_change(up, CLIMB_RAMP_S, 0.0)
+    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_S, 0.0)
     return Motion(
-        velocity=_ramps(flight_plan.path),
-        yaw=_ramps(flight_plan.yaw),
+        velocity=_sum_of_ramps(flight_plan.velocity_ramps),
+        yaw=_sum_of_ramps(flight_plan.yaw_ramps),
         deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S),
         take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
@@ -232,48 +236,52 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     )
 
 
-class _Plan:
+class _FlightPlan:
     """Velocity and yaw ramps of a flight; ramps are placed by the times of their centres."""
 
     def __init__(self, start_s: float, heading_deg: float) -> None:
-        self.centre_s = start_s + CLIMB_RAMP_S / 2.0
-        self.path: list[tuple[float, float, Array]] = []
+        self.ramp_centre_s = start_s + CLIMB_RAMP_S / 2.0
+        self.velocity_ramps: list[tuple[float, float, Array]] = []
         # the first yaw ramp ends before the first data, so the nose then points along the heading
-        self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
+        self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
-    def add_velocity_change(self, velocity: Array, length_s: float, until_next_s: float) -> None:
-        """Add a ramp centred at ``centre_s``, then increase ``centre_s`` by ``until_next_s``."""
-        self.path.append((self.centre_s - length_s / 2.0, length_s, velocity))
-        self.centre_s += until_next_s
+    def add_velocity_change(
+        self, velocity_change_m_s: Array, duration_s: float, until_next_s: float
+    ) -> None:
+        """Add a ramp at ``ramp_centre_s``, then increase this time by ``until_next_s``."""
+        self.velocity_ramps.append(
+            (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
+        )
+        self.ramp_centre_s += until_next_s
 
-    def add_turn(self, angle_rad: float, start_s: float, length_s: float) -> None:
-        self.yaw.append((start_s, length_s, np.array([angle_rad])))
+    def add_turn(self, angle_rad: float, start_s: float, duration_s: float) -> None:
+        self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))
 
 
 def direction(heading_deg: float) -> Array:
     """Return the horizontal unit vector (NED) of a heading in degrees."""
-    heading = np.radians(heading_deg)
-    return np.array([np.cos(heading), np.sin(heading), 0.0])
+    heading_rad = np.radians(heading_deg)
+    return np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
 
 
-def _fly_aisle(flight_plan: _Plan, scenario: Scenario, speed_m_s: float) -> None:
-    velocity = speed_m_s * direction(scenario.heading_deg)
+def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -> None:
+    velocity_m_s = speed_m_s * direction(scenario.heading_deg)
     nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
-    flight_plan.centre_s += START_STOP_S / 2.0
-    for number in range(scenario.passes):
-        pass_velocity = velocity if number % 2 == 0 else -velocity
+    flight_plan.ramp_centre_s += START_STOP_S / 2.0
+    for pass_index in range(scenario.passes):
+        pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
         flight_plan.add_velocity_change(
-            pass_velocity, START_STOP_S, scenario.length_m / scenario.speed_m_s
+            pass_velocity_m_s, START_STOP_S, scenario.length_m / scenario.speed_m_s
         )
-        stop_s = flight_plan.centre_s + START_STOP_S / 2.0
-        flight_plan.add_velocity_change(-pass_velocity, START_STOP_S, START_STOP_S + pause_s)
-        if nose_follows_path and number < scenario.passes - 1:
+        stop_s = flight_plan.ramp_centre_s + START_STOP_S / 2.0
+        flight_plan.add_velocity_change(-pass_velocity_m_s, START_STOP_S, START_STOP_S + pause_s)
+        if nose_follows_path and pass_index < scenario.passes - 1:
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
 
 
-def _fly_loop(flight_plan: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
-    speed = 0.0 if mistakes.no_motion else scenario.speed_m_s
+def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, mistakes: Mistakes) -> None:
+    speed_m_s = 0.0 if mistakes.no_motion else scenario.speed_m_s
     last_side_m = scenario.length_m - mistakes.open_end_m
     if last_side_m < scenario.speed_m_s * CORNER_DURATION_S:
         raise SettingsError(
@@ -281,20 +289,20 @@ def _fly_loop(flight_plan: _Plan, scenario: Scenario, mistakes: Mistakes) -> Non
             f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
         )
     side_count = 4 * scenario.passes
-    previous_velocity = np.zeros(3)
-    flight_plan.centre_s += START_STOP_S / 2.0
-    for side in range(side_count):
-        velocity = speed * direction(scenario.heading_deg + 90.0 * side)
-        length_s = CORNER_DURATION_S if side else START_STOP_S
-        if side and scenario.nose_follows_path and speed > 0.0:
+    previous_velocity_m_s = np.zeros(3)
+    flight_plan.ramp_centre_s += START_STOP_S / 2.0
+    for side_index in range(side_count):
+        velocity_m_s = speed_m_s * direction(scenario.heading_deg + 90.0 * side_index)
+        ramp_duration_s = CORNER_DURATION_S if side_index else START_STOP_S
+        if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
             flight_plan.add_turn(
-                np.pi / 2.0, flight_plan.centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
+                np.pi / 2.0, flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
             )
-        side_m = last_side_m if side == side_count - 1 else scenario.length_m
+        side_m = last_side_m if side_index == side_count - 1 else scenario.length_m
         flight_plan.add_velocity_change(
-            velocity - previous_velocity, length_s, side_m / scenario.speed_m_s
+            velocity_m_s - previous_velocity_m_s, ramp_duration_s, side_m / scenario.speed_m_s
         )
-        previous_velocity = velocity
+        previous_velocity_m_s = velocity_m_s
     flight_plan.add_velocity_change(
-        -previous_velocity, START_STOP_S, START_STOP_S + scenario.pause_s
+        -previous_velocity_m_s, START_STOP_S, START_STOP_S + scenario.pause_s
     )

@@ -8,18 +8,19 @@ from typing import Any, Literal
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
-Kind = Literal["aisle", "loop", "outdoor"]
-Yaw = Literal["fixed", "follow"]
-KINDS: tuple[Kind, ...] = ("aisle", "loop", "outdoor")
-YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
+ScenarioKind = Literal["aisle", "loop", "outdoor"]
+YawMode = Literal["fixed", "follow"]
+KINDS: tuple[ScenarioKind, ...] = ("aisle", "loop", "outdoor")
+YAW_MODES: tuple[YawMode, YawMode] = ("fixed", "follow")
 
 # Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1
-# Duration (s) of acceleration and braking along the aisle, and of a corner of the loop
+# Duration (s) of acceleration and braking along the aisle
 START_STOP_S = 1.5
+# Duration (s) of a corner of the loop
 CORNER_DURATION_S = 2.0
 # Defaults of the scenario that depend on the kind of flight
-DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
+DEFAULTS_OF_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
     "outdoor": {"passes": 3, "length_m": 30.0, "speed_m_s": 4.0, "altitude_m": 8.0},
@@ -52,9 +53,13 @@ def bounded_number(default: Any, *bounds: Any) -> Any:
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
-def quantities(record: type) -> dict[str, Bounds]:
+def bounds_by_field(dataclass_type: type) -> dict[str, Bounds]:
     """Return the bounds of the fields of a dataclass that :func:`bounded_number` made."""
-    return {item.name: item.metadata["quantity"] for item in fields(record) if item.metadata}
+    return {
+        dataclass_field.name: dataclass_field.metadata["quantity"]
+        for dataclass_field in fields(dataclass_type)
+        if dataclass_field.metadata
+    }
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ class Scenario:
         A value is out of range, or the length is too short to reach the speed.
     """
 
-    kind: Kind = "aisle"
+    kind: ScenarioKind = "aisle"
     passes: int = bounded_number(6, 1, 100, "", "--passes")
     length_m: float = bounded_number(
         12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
@@ -101,7 +106,7 @@ class Scenario:
         "Heading of the aisle or of the first side, clockwise from north.",
     )
     altitude_m: float = 1.5
-    yaw: Yaw | None = None
+    yaw: YawMode | None = None
     pause_s: float = 3.0
     wander_m: float = 0.03
     uwb_rate_hz: float = bounded_number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
@@ -149,9 +154,9 @@ class Scenario:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
-        if self.yaw is not None and self.yaw not in YAWS:
-            raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
-        for name, bounds in quantities(Scenario).items():
+        if self.yaw is not None and self.yaw not in YAW_MODES:
+            raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAW_MODES)}.")
+        for name, bounds in bounds_by_field(Scenario).items():
             bounds.check(getattr(self, name), bounds.cli_name)
         min_length_m = self.speed_m_s * (
             START_STOP_S if self.kind == "aisle" else CORNER_DURATION_S
@@ -169,13 +174,21 @@ class Scenario:
 
     @property
     def source_rate_hz(self) -> float:
-        rates = {"aisle": self.uwb_rate_hz, "loop": self.vio_rate_hz, "outdoor": self.gnss_rate_hz}
-        return rates[self.kind]
+        rate_by_kind_hz = {
+            "aisle": self.uwb_rate_hz,
+            "loop": self.vio_rate_hz,
+            "outdoor": self.gnss_rate_hz,
+        }
+        return rate_by_kind_hz[self.kind]
 
     @property
     def source_sigma_m(self) -> float:
-        sigmas = {"aisle": self.sigma_uwb_m, "loop": self.sigma_vio_m, "outdoor": self.sigma_gnss_m}
-        return sigmas[self.kind]
+        sigma_by_kind_m = {
+            "aisle": self.sigma_uwb_m,
+            "loop": self.sigma_vio_m,
+            "outdoor": self.sigma_gnss_m,
+        }
+        return sigma_by_kind_m[self.kind]
 
     @property
     def aid(self) -> Aid:
@@ -188,6 +201,6 @@ class Scenario:
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 
-def make_scenario(kind: Kind, **field_values: Any) -> Scenario:
+def make_scenario(kind: ScenarioKind, **field_values: Any) -> Scenario:
     """Make a scenario with the defaults of its kind, except for ``field_values``."""
     return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **field_values})

@@ -23,19 +23,19 @@ from px4fuse.simulation.ulog_writer import Topic, topic
 # Time since boot (µs) of the first data
 START_US = 12_000_000
 # Mean latency (s) of positions from measurement to arrival in PX4
-LATENCY_S = 0.030
+POSITION_LATENCY_S = 0.030
 # Standard deviation (s) of the latency of positions
-LATENCY_SIGMA_S = 0.003
+POSITION_LATENCY_SIGMA_S = 0.003
 # Minimum latency (s) of positions
 MIN_LATENCY_S = 0.005
-# Standard deviation of the position measurement times, as a fraction of the source interval
-INTERVAL_JITTER = 0.02
+# Standard deviation of the times of position measurements, as fraction of their interval
+POSITION_INTERVAL_JITTER = 0.02
 # Time (s) from the first data to the first position
 FIRST_POSITION_S = 0.1
 # Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
 # Mean number of positions in a burst of outliers
-MEAN_BURST_LENGTH = 3
+MEAN_OUTLIER_BURST_LENGTH = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
 # Time (s) from the measurement of a GNSS position to its timestamp
@@ -44,17 +44,19 @@ FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # Magnetic field (gauss, NED) at HOME_POSITION
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
-# White noise (1 σ, gauss) of the magnetometer, and measurement rate (Hz)
-SIGMA_FIELD_GAUSS = 0.02
-FIELD_RATE_HZ = 14.0
-# White noise (1 σ, m) of the barometer, and measurement rate (Hz)
+# White noise (1 σ, gauss) of the magnetometer
+SIGMA_MAGNETOMETER_GAUSS = 0.02
+# Measurement rate (Hz) of the magnetometer
+MAGNETOMETER_RATE_HZ = 14.0
+# White noise (1 σ, m) of the barometer
 SIGMA_BAROMETER_M = 0.4
+# Measurement rate (Hz) of the barometer
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_M = 0.03
 # Time constant (s) with which EKF2's heading follows a compass error that starts in flight
 HEADING_TIME_CONSTANT_S = 3.0
-# Range of the periods (s) of the sines that are the slow attitude and height errors
+# Range of the periods (s) of the sines whose sum is the slow attitude or height error
 SLOW_ERROR_PERIODS_S = (20.0, 60.0)
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
@@ -139,8 +141,10 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     rate_rad_s = truth.angular_rate_rad_s + gyro_bias_rad_s
     rate_rad_s += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
     if mistakes.vibration_m_s2:
-        sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force_m_s2 += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
+        vibration_sigma_m_s2 = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
+        force_m_s2 += vibration_sigma_m_s2 * random_stream(
+            scenario, Stream.VIBRATION
+        ).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
@@ -152,17 +156,19 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
+    time_us = _grid_us(motion.duration_s, MAGNETOMETER_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
     # outdoors the measured field is rotated, which causes the heading error of EKF2
     if mistakes.heading_deg:
         rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
     field_gauss = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
-    field_gauss += SIGMA_FIELD_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
+    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
         field_gauss.shape
     )
-    at_s = motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
-    field_gauss[seconds(time_us) >= at_s, 1] += mistakes.mag_gauss
+    disturbance_start_s = (
+        motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
+    )
+    field_gauss[seconds(time_us) >= disturbance_start_s, 1] += mistakes.mag_gauss
     return topic("vehicle_magnetometer", timestamps(time_us) | {"magnetometer_ga": field_gauss})
 
 
@@ -181,9 +187,9 @@ def height_error(scenario: Scenario, time_s: Array) -> Array:
     return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
-def limit_rate(full_topic: Topic, rate_hz: float) -> Topic:
+def limit_rate(unlimited_topic: Topic, rate_hz: float) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    return _select_messages(full_topic, keep_at_rate(time_s(full_topic), rate_hz))
+    return _select_messages(unlimited_topic, keep_at_rate(time_s(unlimited_topic), rate_hz))
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
@@ -224,9 +230,9 @@ def mean_imu_at_rest(
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
-    truth = attitude(motion.at(seconds(time_us))).body_to_ned
-    error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
-    logged_quaternions = quaternions(error @ truth)
+    true_rotation = attitude(motion.at(seconds(time_us))).body_to_ned
+    error_rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
+    logged_quaternions = quaternions(error_rotation @ true_rotation)
     return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
 
 
@@ -252,24 +258,26 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
     tilt_deg, yaw_deg = scenario.tilt_error_deg, scenario.yaw_error_deg
     rms_rad = np.radians([tilt_deg, tilt_deg, yaw_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
-    error = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
+    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
-        size = np.radians(mistakes.heading_deg)
+        heading_error_rad = np.radians(mistakes.heading_deg)
         if mistakes.heading_at_s is not None:
-            size *= -np.expm1(
+            heading_error_rad *= -np.expm1(
                 -np.maximum(time_s - mistakes.heading_at_s, 0.0) / HEADING_TIME_CONSTANT_S
             )
-        error[:, 2] += size
-    return Rotation.from_rotvec(error)
+        error_rad[:, 2] += heading_error_rad
+    return Rotation.from_rotvec(error_rad)
 
 
 def land_detector(motion: Motion) -> Topic:
     """Simulate vehicle_land_detected, logged once a second and at take-off and landing."""
-    changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
-    time_us = np.union1d(
-        np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), changes_us
+    landed_changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(
+        np.int64
     )
-    is_landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
+    time_us = np.union1d(
+        np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), landed_changes_us
+    )
+    is_landed = (time_us < landed_changes_us[0]) | (time_us >= landed_changes_us[1])
     landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
     return topic("vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags})
 
@@ -288,10 +296,10 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
     timing_rng = random_stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
-    count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
-    nominal_s = FIRST_POSITION_S + interval_s * np.arange(count)
+    position_count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
+    nominal_s = FIRST_POSITION_S + interval_s * np.arange(position_count)
     # jitter below half an interval keeps the positions in order
-    jitter = np.clip(timing_rng.normal(0.0, INTERVAL_JITTER, count), -0.4, 0.4)
+    jitter = np.clip(timing_rng.normal(0.0, POSITION_INTERVAL_JITTER, position_count), -0.4, 0.4)
     time_s = np.maximum(nominal_s + jitter * interval_s, 0.0)
     state = motion.at(time_s)
     position_m = state.position_m.copy()
@@ -315,22 +323,24 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     if mistakes.yaw_deg:
         position_m = Rotation.from_euler("z", mistakes.yaw_deg, degrees=True).apply(position_m)
     if mistakes.jump_m:
-        at_s = motion.duration_s / 1.5 if mistakes.jump_at_s is None else mistakes.jump_at_s
-        position_m[time_s >= at_s] += mistakes.jump_m * direction(scenario.heading_deg)
+        jump_start_s = motion.duration_s / 1.5 if mistakes.jump_at_s is None else mistakes.jump_at_s
+        position_m[time_s >= jump_start_s] += mistakes.jump_m * direction(scenario.heading_deg)
     is_logged = _is_outside_gap(
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
     ) & keep_at_rate(time_s, mistakes.decimate_hz)
     arrival_us, timestamp_us = _source_times_us(mistakes, time_s, timing_rng)
-    reported_m = reported_sigma_m(scenario, mistakes)
+    reported_sigma = reported_sigma_m(scenario, mistakes)
     velocity_m_s = None
     if is_outdoor:
-        noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(position_m.shape)
-        velocity_m_s = (state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * noise)[
-            is_logged
-        ]
+        velocity_noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(
+            position_m.shape
+        )
+        velocity_m_s = (
+            state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * velocity_noise
+        )[is_logged]
         fix_us = timestamp_us + round(1e6 * FIX_AGE_S)
         topic = _gnss_topic(
-            fix_us[is_logged], position_m[is_logged], velocity_m_s, reported_m, scenario
+            fix_us[is_logged], position_m[is_logged], velocity_m_s, reported_sigma, scenario
         )
     else:
         rotation = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
@@ -338,7 +348,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
             arrival_us[is_logged],
             timestamp_us[is_logged],
             position_m[is_logged],
-            reported_m,
+            reported_sigma,
             rotation,
         )
     return SimulatedPositions(
@@ -360,10 +370,12 @@ def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
 
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
-    noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+    noise_m = (
+        random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+    )
     decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
-    noise[1:] *= np.sqrt(1.0 - decay_factor**2)
-    return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise, axis=0))
+    noise_m[1:] *= np.sqrt(1.0 - decay_factor**2)
+    return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
@@ -386,25 +398,25 @@ def outliers(
     offset_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
     airborne_indices = np.flatnonzero(is_airborne)
-    count = round(len(airborne_indices) * mistakes.nlos_percent / 100.0)
-    if count == 0:
+    outlier_count = round(len(airborne_indices) * mistakes.nlos_percent / 100.0)
+    if outlier_count == 0:
         return offset_m, is_outlier
     rng = random_stream(scenario, Stream.NLOS)
-    burst_count = -(-count // MEAN_BURST_LENGTH)
+    burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_LENGTH)
     burst_lengths = 1 + rng.multinomial(
-        count - burst_count, np.full(burst_count, 1.0 / burst_count)
+        outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
     )
     gap_lengths = rng.multinomial(
-        len(airborne_indices) - count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
+        len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
     burst_starts = np.cumsum(gap_lengths[:-1]) + np.cumsum(burst_lengths) - burst_lengths
     burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    index_in_burst = np.arange(count) - np.repeat(
+    index_in_burst = np.arange(outlier_count) - np.repeat(
         np.cumsum(burst_lengths) - burst_lengths, burst_lengths
     )
     outlier_indices = airborne_indices[burst_starts[burst_index] + index_in_burst]
     angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
-    size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, count)
+    size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
     offset_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
     offset_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
     is_outlier[outlier_indices] = True
@@ -423,8 +435,10 @@ def _source_times_us(
     mistakes: Mistakes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Simulate arrival time and timestamp of each position (µs from the first data)."""
-    mean_latency_s = mistakes.clock_jump_s or LATENCY_S
-    latency_s = np.maximum(rng.normal(mean_latency_s, LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S)
+    mean_latency_s = mistakes.clock_jump_s or POSITION_LATENCY_S
+    latency_s = np.maximum(
+        rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S
+    )
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
     offset_s = mistakes.clock_offset_s + mistakes.clock_drift_ppm * 1e-6 * time_s
     timestamp_us = np.rint((time_s + offset_s) * 1e6).astype(np.int64)

@@ -130,5 +130,8 @@ def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
     records["_number"] = topic_id
     for name, values in topic.fields.items():
         records[name] = values
-    content, width = records.tobytes(), dtype.itemsize
-    return [content[start : start + width] for start in range(0, len(content), width)]
+    message_bytes, message_size = records.tobytes(), dtype.itemsize
+    return [
+        message_bytes[start : start + message_size]
+        for start in range(0, len(message_bytes), message_size)
+    ]

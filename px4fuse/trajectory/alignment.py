@@ -17,15 +17,16 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of a motion that determines a rotation, as fraction of the largest extent
+# Minimum extent of the motion for an estimate of rotation, as fraction of the largest extent
 MIN_EXTENT_FRACTION = 1e-6
-# Minimum extent (m, RMS) of a motion that determines a rotation
+# Minimum extent (m, RMS) of the motion for an estimate of rotation
 MIN_EXTENT_M = 1e-6
-# Maximum ratio of the residual to the horizontal motion for an estimate of yaw: noise alone has √2
-MAX_PLANE_RATIO = 1.0
-# Maximum ratio of the residual to the motion perpendicular to the main direction for an estimate of
-# the full rotation: noise alone has √6
-MAX_LINE_RATIO = 2.0
+# Maximum ratio of residual to horizontal motion for an estimate of yaw: two tracks of pure noise
+# have √2
+MAX_YAW_RESIDUAL_RATIO = 1.0
+# Maximum ratio of residual to motion perpendicular to the main direction, for an estimate of the
+# full rotation: two tracks of pure noise have √6
+MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
 class Transform(Record, frozen=True):
@@ -91,9 +92,15 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
     if kind == "yaw":
-        x, y = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
-        heading = float(np.angle(np.vdot(x - x.mean(), y - y.mean())))
-        transform = _align_means(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
+        estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
+        yaw_rad = float(
+            np.angle(
+                np.vdot(
+                    estimate_xy_m - estimate_xy_m.mean(), reference_xy_m - reference_xy_m.mean()
+                )
+            )
+        )
+        transform = _align_means(Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4)
         _require_determined(transform, estimate_m, reference_m, kind)
         return transform
     # The motion is tested with a fitted scale, because a scale factor error does not make the
@@ -129,9 +136,9 @@ def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
     """Return the transform with this rotation and scale that aligns the means (eq. 41)."""
-    shift = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
+    translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
-    return Transform((w, x, y, z), tuple(shift.tolist()), scale, degrees_of_freedom)
+    return Transform((w, x, y, z), tuple(translation_m.tolist()), scale, degrees_of_freedom)
 
 
 def _principal_extents(position_m: Array) -> Array:
@@ -156,20 +163,25 @@ def _require_determined(
             float(np.hypot(*_principal_extents(m[:, :2]))) for m in (estimate_m, reference_m)
         )
         residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
-        length = float(np.linalg.norm(reference_extents))
-        limit = MAX_PLANE_RATIO
+        max_extent_m = float(np.linalg.norm(reference_extents))
+        max_residual_ratio = MAX_YAW_RESIDUAL_RATIO
         motion_text = "horizontal motion"
-        alternative = "none"
+        possible_alignment = "none"
     else:
         # motion along a line does not determine the rotation around the line
-        length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
+        max_extent_m, extent_m, _ = np.minimum(
+            transform.scale * estimate_extents, reference_extents
+        )
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
-        limit = MAX_LINE_RATIO
+        max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
         motion_text = "motion perpendicular to the main direction"
-        alternative = "yaw or none"
-    if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
+        possible_alignment = "yaw or none"
+    if (
+        extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * max_extent_m)
+        or residual_m > max_residual_ratio * extent_m
+    ):
         raise TrajectoryError(
             f"the alignment {kind} cannot be estimated: the {motion_text} is {extent_m:.2g} m "
             f"(RMS), and the residual after alignment is {residual_m:.2g} m",
-            f"Use `alignment` {alternative}.",
+            f"Use `alignment` {possible_alignment}.",
         )

@@ -8,18 +8,19 @@ import numpy as np
 from px4fuse.core.arrays import BoolArray
 from px4fuse.trajectory.model import Trajectory
 
-# Maximum rotation (rad) of a constant orientation: rounding of the digits in a file
+# Maximum rotation (rad) in a constant orientation, from rounded digits in a file
 MAX_CONSTANT_ROTATION_RAD = 1e-6
 # Minimum number of poses, and minimum motion (m), for a constant orientation
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
-# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference in that time
+# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference during a frozen
+# pose
 MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
 # Minimum constant rotation (rad) between orientations of different body axes
 MIN_BODY_ROTATION_RAD = np.radians(30.0)
 # Maximum RMS deviation (rad) from the constant rotation between body axes
 MAX_BODY_DEVIATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
-ITERATIONS = 5
+LEVER_ARM_ITERATIONS = 5
 
 
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
@@ -44,12 +45,12 @@ def find_frozen_poses(
         start_s, end_s = estimate.time_s[[start, end - 1]].tolist()
         if end_s - start_s < MIN_FROZEN_S:
             continue
-        is_inside = (reference.time_s >= start_s + time_offset_s) & (
+        is_at_same_time = (reference.time_s >= start_s + time_offset_s) & (
             reference.time_s <= end_s + time_offset_s
         )
-        if not is_inside.any():
+        if not is_at_same_time.any():
             continue
-        motion_m = float(np.linalg.norm(np.ptp(reference.position_m[is_inside], axis=0)))
+        motion_m = float(np.linalg.norm(np.ptp(reference.position_m[is_at_same_time], axis=0)))
         if motion_m > MIN_FROZEN_MOTION_M:
             is_frozen[start + 1 : end] = True
             warnings.append(
@@ -61,7 +62,7 @@ def find_frozen_poses(
     return is_frozen, tuple(warnings)
 
 
-def has_other_body(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
+def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
     """Return True if the orientations are of different body axes, such as those of a camera."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False

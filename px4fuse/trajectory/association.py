@@ -13,13 +13,13 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the maximum gap in the reference to interpolate over, in median intervals
+# Default of the maximum gap in the reference that is interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum interval (s) of a reference whose poses are paired instead of interpolated
+# Minimum pose interval (s) of a reference that is paired with the estimate, not interpolated
 MIN_SPARSE_INTERVAL_S = 2.0
-# Lower limit (s) of the default of the maximum gap
+# Minimum value (s) of the default maximum gap in the reference that is interpolated
 MIN_GAP_LIMIT_S = 0.1
-# Maximum time difference (s) of two poses that are paired: default of the evo package
+# Maximum time difference (s) of a pair of poses: default of the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
 
 
@@ -98,21 +98,23 @@ def associate(
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    outside = int(
+    outside_count = int(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
     )
-    steps_s = np.diff(time_s[pose_indices])
-    max_step_s = max(5.0 * estimate_interval_s, 0.5)
-    covered_fraction = float(steps_s[steps_s <= max_step_s].sum() / (last_s - first_s))
+    used_steps_s = np.diff(time_s[pose_indices])
+    max_used_step_s = max(5.0 * estimate_interval_s, 0.5)
+    covered_fraction = float(
+        used_steps_s[used_steps_s <= max_used_step_s].sum() / (last_s - first_s)
+    )
     used_count = len(np.unique(pose_indices))
-    all_poses = len(estimate)
+    pose_count = len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
         max_gap_s=limit_s,
-        outside=outside,
-        in_gaps=all_poses - outside - used_count,
-        coverage_estimate=used_count / all_poses,
+        outside=outside_count,
+        in_gaps=pose_count - outside_count - used_count,
+        coverage_estimate=used_count / pose_count,
         coverage_reference=min(covered_fraction, 1.0),
     )
     return estimate[pose_indices], matched_reference, association
@@ -128,9 +130,9 @@ def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray
 
     Times that equal a reference time are included.
     """
-    right_row = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    previous_s = reference_s[right_row - 1]
-    next_s = reference_s[right_row]
+    right_rows = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
+    previous_s = reference_s[right_rows - 1]
+    next_s = reference_s[right_rows]
     is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
     return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
 
@@ -161,15 +163,19 @@ def _pair_nearest(
     Return the pose indices of both. Pairs with a time difference above ``limit_s`` are omitted.
     """
     # The offset is added to the longer series, to have the same rounding as evo
-    has_more = len(estimate_s) > len(reference_s)
-    fewer_s = reference_s if has_more else estimate_s
-    more_s = estimate_s + offset_s if has_more else reference_s - offset_s
-    right_row = np.minimum(np.searchsorted(more_s, fewer_s, side="right"), len(more_s) - 1)
-    left_row = np.maximum(right_row - 1, 0)
-    nearest_row = np.where(
-        np.abs(more_s[right_row] - fewer_s) < np.abs(fewer_s - more_s[left_row]),
-        right_row,
-        left_row,
+    is_estimate_longer = len(estimate_s) > len(reference_s)
+    shorter_s = reference_s if is_estimate_longer else estimate_s
+    longer_s = estimate_s + offset_s if is_estimate_longer else reference_s - offset_s
+    right_rows = np.minimum(np.searchsorted(longer_s, shorter_s, side="right"), len(longer_s) - 1)
+    left_rows = np.maximum(right_rows - 1, 0)
+    nearest_rows = np.where(
+        np.abs(longer_s[right_rows] - shorter_s) < np.abs(shorter_s - longer_s[left_rows]),
+        right_rows,
+        left_rows,
     )
-    pair_rows = np.flatnonzero(np.abs(more_s[nearest_row] - fewer_s) <= limit_s)
-    return (nearest_row[pair_rows], pair_rows) if has_more else (pair_rows, nearest_row[pair_rows])
+    pair_rows = np.flatnonzero(np.abs(longer_s[nearest_rows] - shorter_s) <= limit_s)
+    return (
+        (nearest_rows[pair_rows], pair_rows)
+        if is_estimate_longer
+        else (pair_rows, nearest_rows[pair_rows])
+    )

@@ -21,19 +21,20 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
 from px4fuse.trajectory.artefacts import (
-    ITERATIONS,
+    LEVER_ARM_ITERATIONS,
     drop_constant_orientation,
     find_frozen_poses,
-    has_other_body,
+    has_other_body_axes,
 )
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-# Maximum scale factor error of the estimate without a warning
+# Maximum scale factor error (ratio minus 1) of the estimate without a warning
 MAX_SCALE_ERROR = 0.1
-# Minimum fraction of used poses, and of covered time of the reference, without a warning
+# Minimum fraction of used poses of the estimate, and of covered time of the reference, without a
+# warning
 MIN_COVERAGE = 0.5
 # Minimum estimated time offset (s) for a warning that the clocks differ: a filter lags by less
 MIN_DOUBTFUL_OFFSET_S = 0.1
@@ -143,10 +144,10 @@ def evaluate(
     (estimate, reference), constant_notes = zip(
         *map(drop_constant_orientation, (estimate, reference)), strict=True
     )
-    offset, offset_warnings = _choose_time_offset(estimate, reference, time_offset_s)
-    added_offset_s = offset.offset_s or 0.0
+    time_offset, offset_warnings = _choose_time_offset(estimate, reference, time_offset_s)
+    added_offset_s = time_offset.offset_s or 0.0
     is_frozen, frozen_warnings = find_frozen_poses(estimate, reference, added_offset_s)
-    matched_estimate, matched_reference, matched = associate(
+    matched_estimate, matched_reference, association_result = associate(
         estimate[~is_frozen] if is_frozen.any() else estimate,
         reference,
         method=association,
@@ -163,7 +164,7 @@ def evaluate(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
     aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
-    if not notes and has_other_body(aligned_estimate, matched_reference):
+    if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
         )
@@ -174,7 +175,9 @@ def evaluate(
             transform.apply(matched_estimate.position_m), transform.rotation
         )
     distance_m = cumulative_distance(matched_reference.position_m)
-    error_m = np.linalg.norm(aligned_estimate.position_m - matched_reference.position_m, axis=1)
+    position_error_m = np.linalg.norm(
+        aligned_estimate.position_m - matched_reference.position_m, axis=1
+    )
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
     rotation_statistics: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
@@ -190,10 +193,12 @@ def evaluate(
         alignment=alignment,
         alignment_reason=reason,
         transform=transform,
-        association=matched,
-        time_offset=offset,
+        association=association_result,
+        time_offset=time_offset,
         ate=AbsoluteError(
-            scores.statistics(error_m), scores.rmse_interval(error_m, "ATE"), rotation_statistics
+            scores.statistics(position_error_m),
+            scores.rmse_interval(position_error_m, "ATE"),
+            rotation_statistics,
         ),
         rpe=tuple(
             scores.relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
@@ -204,14 +209,16 @@ def evaluate(
         unaligned_m=matched_estimate.position_m,
         estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
-        position_error_m=error_m,
+        position_error_m=position_error_m,
         notes=(*constant_notes[0], *constant_notes[1], *notes),
         warnings=(
             *frozen_warnings,
             *line_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
-            *_comparison_warnings(matched_estimate, matched_reference, matched, alignment),
+            *_comparison_warnings(
+                matched_estimate, matched_reference, association_result, alignment
+            ),
         ),
     )
 
@@ -223,8 +230,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
     exceeds 10 %. The reason for the choice is returned as a sentence.
     """
-    same_frame = estimate.frame == reference.frame != "unknown"
-    if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
+    has_same_frame = estimate.frame == reference.frame != "unknown"
+    if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return "none", "The estimate is not aligned, because the estimate is ground truth."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any(
@@ -296,13 +303,18 @@ def _choose_time_offset(
     is_estimated = given_s == "auto" or is_disjoint
     if not (is_estimated or are_clocks_unrelated):
         return clock_offset, []
-    estimated = estimate_time_offset(estimate, reference)
+    estimated_offset = estimate_time_offset(estimate, reference)
     if is_estimated:
-        if estimated.is_determinable:
-            return estimated, []
-        fallback = structs.replace(clock_offset, is_determinable=False, reason=estimated.reason)
-        return fallback, [f"{estimated.reason} Instead, px4fuse uses {clock_text}."]
-    offset_s, (low_s, high_s) = estimated.offset_s or 0.0, estimated.interval_s or (0.0, 0.0)
+        if estimated_offset.is_determinable:
+            return estimated_offset, []
+        fallback = structs.replace(
+            clock_offset, is_determinable=False, reason=estimated_offset.reason
+        )
+        return fallback, [f"{estimated_offset.reason} Instead, px4fuse uses {clock_text}."]
+    offset_s, (low_s, high_s) = (
+        estimated_offset.offset_s or 0.0,
+        estimated_offset.interval_s or (0.0, 0.0),
+    )
     is_doubtful = not low_s <= 0.0 <= high_s and abs(offset_s) >= MIN_DOUBTFUL_OFFSET_S
     warning = (
         f"The timestamps are unchanged, but the motions match best with {offset_s:+.3f} s added "
@@ -380,29 +392,29 @@ def _move_to_reference_body(
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
-    arm_m, corrected = np.zeros(3), estimate
-    for _ in range(ITERATIONS):
-        transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
+    lever_arm_m, corrected_estimate = np.zeros(3), estimate
+    for _ in range(LEVER_ARM_ITERATIONS):
+        transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
         body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
         centred_axes = reference.rotation.as_matrix()
         centred_axes = centred_axes - centred_axes.mean(axis=0)
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
-        arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
-        shift_m = (estimate.rotation * body_rotation).apply(arm_m) / transform.scale
-        corrected = replace(
+        lever_arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
+        shift_m = (estimate.rotation * body_rotation).apply(lever_arm_m) / transform.scale
+        corrected_estimate = replace(
             estimate,
             position_m=estimate.position_m - shift_m,
             rotation=estimate.rotation * body_rotation,
         )
-    components = ", ".join(
-        f"{value:+.2f} m along {axis}" for value, axis in zip(arm_m, "xyz", strict=True)
+    lever_arm_text = ", ".join(
+        f"{value:+.2f} m along {axis}" for value, axis in zip(lever_arm_m, "xyz", strict=True)
     )
-    return corrected, (
+    return corrected_estimate, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
         "estimate has other body axes than the reference, for example those of a camera. Its "
-        f"origin is at {components} of the reference body. Both are corrected before the "
+        f"origin is at {lever_arm_text} of the reference body. Both are corrected before the "
         "errors are computed.",
     )
 

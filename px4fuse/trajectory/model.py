@@ -15,7 +15,7 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, Record
 
 # Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
-Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
+TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 # World frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
@@ -68,7 +68,7 @@ class Track(Record, frozen=True):
     name: str
     sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
     size_bytes: Count
-    kind: Kind
+    kind: TrajectoryKind
     frame: Frame
     poses: Count
     start_s: float
@@ -85,7 +85,7 @@ class Trajectory:
     ----------
     name : str
         File name without folder; for a flight log followed by the track name ("log.ulg:vio").
-    kind : Kind
+    kind : TrajectoryKind
     time_s : ndarray, shape (n,)
         Strictly increasing times (s): timestamps of the file, or time since the first data of a
         log.
@@ -107,7 +107,7 @@ class Trajectory:
     """
 
     name: str
-    kind: Kind
+    kind: TrajectoryKind
     time_s: Array
     position_m: Array
     rotation: Rotation | None

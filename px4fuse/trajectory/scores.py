@@ -17,7 +17,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-Unit = Literal["frames", "m", "s"]
+DeltaUnit = Literal["frames", "m", "s"]
 
 # Maximum relative deviation of the distance of an RPE pair from delta, if all pairs are used:
 # default of the evo package
@@ -51,7 +51,7 @@ class Delta:
     """Distance between the two poses of an RPE pair in frames, metres or seconds."""
 
     value: float
-    unit: Unit
+    unit: DeltaUnit
 
     def __str__(self) -> str:
         return f"{self.value:g} {self.unit}"
@@ -108,7 +108,7 @@ class RelativeError(Record, frozen=True):
     """
 
     delta: float
-    unit: Unit
+    unit: DeltaUnit
     all_pairs: bool
     pairs_from: Literal["reference"]
     translation_m: OrUnavailable[Statistics]
@@ -136,20 +136,25 @@ def statistics(errors: Array) -> Statistics:
 
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
-    length_m = float(distance_m[-1])
-    span_s = float(time_s[-1] - time_s[0])
+    path_length_m = float(distance_m[-1])
+    duration_s = float(time_s[-1] - time_s[0])
     # The minimum distance or time of a pair is two median intervals between poses
     median_step_m = median_interval(distance_m)
     median_interval_s = median_interval(time_s)
-    min_distance_m = max(MIN_DELTA_FRACTION * length_m, 2.0 * median_step_m)
-    max_distance_m = MAX_DELTA_FRACTION * length_m
-    distances = [
+    min_distance_m = max(MIN_DELTA_FRACTION * path_length_m, 2.0 * median_step_m)
+    max_distance_m = MAX_DELTA_FRACTION * path_length_m
+    distances_m = [
         value for value in DEFAULT_DISTANCES_M if min_distance_m <= value <= max_distance_m
     ][-MAX_DISTANCE_DELTAS:]
-    times = [
-        t for t in DEFAULT_TIMES_S if 2.0 * median_interval_s <= t <= MAX_DELTA_FRACTION * span_s
+    times_s = [
+        t
+        for t in DEFAULT_TIMES_S
+        if 2.0 * median_interval_s <= t <= MAX_DELTA_FRACTION * duration_s
     ][-MAX_TIME_DELTAS:]
-    return (*(Delta(value, "m") for value in distances), *(Delta(value, "s") for value in times))
+    return (
+        *(Delta(value, "m") for value in distances_m),
+        *(Delta(value, "s") for value in times_s),
+    )
 
 
 def find_pairs(
@@ -169,7 +174,7 @@ def find_pairs(
 
     Returns
     -------
-    start, end : ndarray of int, shape (k,)
+    start_indices, end_indices : ndarray of int, shape (k,)
 
     Raises
     ------
@@ -178,38 +183,44 @@ def find_pairs(
     """
     if not (np.isfinite(delta.value) and delta.value > 0.0):
         raise SettingsError(f"RPE delta {delta}: the value must be positive.")
-    n = len(time_s)
+    pose_count = len(time_s)
     if delta.unit == "frames":
         step = int(delta.value)
         if step != delta.value:
             raise SettingsError(f"RPE delta {delta}: the number of frames must be an integer.")
-        start = np.arange(0, max(n - step, 0), 1 if all_pairs else step)
-        return start, start + step
-    travelled = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
+        start_indices = np.arange(0, max(pose_count - step, 0), 1 if all_pairs else step)
+        return start_indices, start_indices + step
+    distance_or_time = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
-        return _consecutive_pairs(np.diff(travelled), delta.value)
-    start = np.arange(n - 1)
+        return _consecutive_pairs(np.diff(distance_or_time), delta.value)
+    start_indices = np.arange(pose_count - 1)
     # Neighbours of the nearest pose are tested, too, because of rounding errors
-    nearest_guess = np.searchsorted(travelled, travelled + delta.value)[:-1]
-    candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
-    distance_error = np.abs(travelled[candidates] - travelled[start, None] - delta.value)
-    best_candidate = np.argmin(distance_error, axis=1)
+    nearest_guess = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
+    candidates = np.clip(
+        nearest_guess[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
+    )
+    distance_error = np.abs(
+        distance_or_time[candidates] - distance_or_time[start_indices, None] - delta.value
+    )
+    best_columns = np.argmin(distance_error, axis=1)
     # If several poses have an equal distance (at rest), the first is used
-    first_equal = np.searchsorted(travelled, travelled[candidates[start, best_candidate]])
-    is_near = distance_error[start, best_candidate] <= DELTA_TOLERANCE * delta.value
-    return start[is_near], np.maximum(first_equal, start + 1)[is_near]
+    first_equal_indices = np.searchsorted(
+        distance_or_time, distance_or_time[candidates[start_indices, best_columns]]
+    )
+    is_near = distance_error[start_indices, best_columns] <= DELTA_TOLERANCE * delta.value
+    return start_indices[is_near], np.maximum(first_equal_indices, start_indices + 1)[is_near]
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
     # The distance of each pair is summed from zero, to have the same rounding as evo
-    ends = [0]
-    travelled = 0.0
+    pair_ends = [0]
+    distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
-        travelled += step
-        if travelled >= delta:
-            ends.append(index)
-            travelled = 0.0
-    end_indices = np.array(ends, dtype=np.intp)
+        distance_or_time += step
+        if distance_or_time >= delta:
+            pair_ends.append(index)
+            distance_or_time = 0.0
+    end_indices = np.array(pair_ends, dtype=np.intp)
     return end_indices[:-1], end_indices[1:]
 
 
@@ -226,9 +237,11 @@ def relative_error(
     delta, all_pairs
         See :func:`find_pairs`; distances are measured along the reference.
     """
-    start, end = find_pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
+    start_indices, end_indices = find_pairs(
+        reference.position_m, reference.time_s, delta, all_pairs=all_pairs
+    )
     analysis_name = f"RPE over {delta}"
-    if not len(start):
+    if not len(start_indices):
         no_pair = Unavailable(
             analysis_name,
             f"the reference has no pair of poses with a distance of {delta}",
@@ -238,23 +251,25 @@ def relative_error(
             delta.value, delta.unit, all_pairs, "reference", no_pair, no_pair, no_pair
         )
     motions = [
-        track.position_m[end] - track.position_m[start] for track in (aligned_estimate, reference)
+        track.position_m[end_indices] - track.position_m[start_indices]
+        for track in (aligned_estimate, reference)
     ]
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
     rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
         rotation_deg = rotations  # both motions are compared in the frame of the reference
     else:
-        inverses = [rotation[start].inv() for rotation in rotations]
+        inverses = [rotation[start_indices].inv() for rotation in rotations]
         motions = [inverse.apply(motion) for inverse, motion in zip(inverses, motions, strict=True)]
-        turn, reference_turn = (
-            inverse * rotation[end] for inverse, rotation in zip(inverses, rotations, strict=True)
+        estimated_turn, reference_turn = (
+            inverse * rotation[end_indices]
+            for inverse, rotation in zip(inverses, rotations, strict=True)
         )
-        rotation_deg = statistics(np.degrees((reference_turn.inv() * turn).magnitude()))
+        rotation_deg = statistics(np.degrees((reference_turn.inv() * estimated_turn).magnitude()))
     # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
     translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
-    overlap = int(np.median(end - start)) if all_pairs else 1
-    interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
+    overlap_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
+    interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap_count)
     return RelativeError(
         delta.value,
         delta.unit,
@@ -290,26 +305,26 @@ def rmse_interval(
     ``min_block`` is the number of pairs that overlap, because overlap correlates errors.
     """
     squares = errors**2
-    n = len(squares)
-    length = max(
+    error_count = len(squares)
+    block_length = max(
         int(np.ceil(BLOCK_CORRELATION_TIMES * autocorrelation_time(squares))), min_block, 1
     )
-    if n < MIN_BOOTSTRAP_BLOCKS * length:
+    if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
             f"95 % interval of the {analysis_name} RMSE",
-            f"the errors are correlated over {length} of {n} samples, so there are fewer than "
-            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
+            f"the errors are correlated over {block_length} of {error_count} samples, so there are "
+            f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
     cumulative_squares = np.concatenate(
-        ([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1]))))
+        ([0.0], np.cumsum(np.concatenate((squares, squares[: block_length - 1]))))
     )
     block_means = (
-        cumulative_squares[length:] - cumulative_squares[:-length]
-    ) / length  # mean squared error of each circular block
-    block_count = n / length
+        cumulative_squares[block_length:] - cumulative_squares[:-block_length]
+    ) / block_length  # mean squared error of each circular block
+    block_count = error_count / block_length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
-        0, n, (BOOTSTRAP_RESAMPLES, round(block_count))
+        0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     resampled_means = block_means[block_starts].mean(axis=1)
     quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
@@ -317,7 +332,7 @@ def rmse_interval(
     low, high = np.sqrt(
         np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
     )
-    return Interval(float(low), float(high), length, block_count)
+    return Interval(float(low), float(high), block_length, block_count)
 
 
 def autocorrelation_time(values: Array) -> float:
@@ -328,8 +343,12 @@ def autocorrelation_time(values: Array) -> float:
     centred_values = values - values.mean()
     if not centred_values.any():
         return 1.0
-    n = len(centred_values)
-    covariance = autocovariance(centred_values)
-    times = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    long_windows = np.flatnonzero(np.arange(n) >= WINDOW_CORRELATION_TIMES * times)
-    return max(1.0, float(times[long_windows[0]] if len(long_windows) else n))
+    sample_count = len(centred_values)
+    covariance_by_lag = autocovariance(centred_values)
+    correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
+    long_windows = np.flatnonzero(
+        np.arange(sample_count) >= WINDOW_CORRELATION_TIMES * correlation_times
+    )
+    return max(
+        1.0, float(correlation_times[long_windows[0]] if len(long_windows) else sample_count)
+    )

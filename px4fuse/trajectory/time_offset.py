@@ -35,29 +35,30 @@ MIN_OVERLAP_FRACTION = 0.5
 # Minimum number of overlapping poses, as fraction of the poses in the time span of the shorter
 # trajectory
 MIN_POSES_FRACTION = 0.3
-# Maximum number of correlation peaks for which the ATE is computed
+# Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
 MAX_CANDIDATES = 12
 # Half-width (s) of the least-squares search around a correlation peak
 SEARCH_WINDOW_S = 0.5
 # Half-width (s) of the least-squares search around the first result
 FINE_SEARCH_WINDOW_S = 0.1
-# Minimum distance (s) between two correlation peaks
+# Minimum distance (s) between two peaks of the speed correlation
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of another offset's residual (RMS) to the best residual for an unambiguous result:
-# 95 % limit of an F-test with 80 independent residuals, half a minute of flight
+# Minimum ratio of the residual (RMS) at another time offset to the best residual, for an
+# unambiguous time offset: 95 % limit of an F-test with 80 independent residuals, half a minute of
+# flight
 MIN_SECOND_PEAK_RATIO = 1.2
-# Maximum number of poses in the least-squares fit
+# Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
-# Maximum ratio of the residual to the extent of the motion for accepting a fit
+# Maximum ratio of residual to extent of the motion for accepting a fit of the time offset
 MAX_MISFIT = 0.5
-# Ratio of the residual to the extent of the motion below which two fits are equally good
+# Ratio of residual to extent of the motion below which two fits of the time offset are equally good
 MIN_MISFIT = 1e-3
-# Minimum free velocity (RMS) as fraction of the speed: this component, which a similarity transform
-# cannot explain, determines the time offset
+# Minimum free velocity (RMS) as fraction of the speed: the free velocity is the part that a
+# similarity transform cannot explain
 MIN_FREE_SPEED_FRACTION = 0.05
-# Minimum correlation of the free velocities of both trajectories, which excludes noise
+# Minimum correlation of the free velocities of both trajectories: noise is not correlated
 MIN_FREE_CORRELATION = 0.5
 # Window of the long-run variance of the likelihood score, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4
@@ -152,7 +153,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
             f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
-    # The fit is repeated with more poses: all that overlap in time near the first estimated offset
+    # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_WINDOW_S)
         or best_fit
@@ -181,18 +182,20 @@ def _not_determinable(reason: str) -> TimeOffset:
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
     """Compute smoothed velocities (m/s) on a regular time grid."""
-    time = trajectory.time_s
-    grid = time[0] + step_s * np.arange(int((time[-1] - time[0]) / step_s) + 1)
-    sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
-    smooth: Array = gaussian_filter1d(positions_at(trajectory, grid), sigma, axis=0, order=1)
-    return grid, smooth / step_s
+    time_s = trajectory.time_s
+    grid_s = time_s[0] + step_s * np.arange(int((time_s[-1] - time_s[0]) / step_s) + 1)
+    sigma_samples = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
+    velocity_step_m: Array = gaussian_filter1d(
+        positions_at(trajectory, grid_s), sigma_samples, axis=0, order=1
+    )
+    return grid_s, velocity_step_m / step_s
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
-    span = float(trajectory.time_s[-1] - trajectory.time_s[0])
-    grid, velocity = _grid_velocity(trajectory, max(GRID_STEP_S, span / MAX_GRID_SAMPLES))
-    return np.stack([np.interp(time_s, grid, column) for column in velocity.T], axis=1)
+    duration_s = float(trajectory.time_s[-1] - trajectory.time_s[0])
+    grid_s, velocity = _grid_velocity(trajectory, max(GRID_STEP_S, duration_s / MAX_GRID_SAMPLES))
+    return np.stack([np.interp(time_s, grid_s, column) for column in velocity.T], axis=1)
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
@@ -200,17 +203,17 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
     Also return a mask of the times outside of gaps.
     """
-    time = trajectory.time_s
-    grid, velocity = _grid_velocity(trajectory, step_s)
+    time_s = trajectory.time_s
+    grid_s, velocity = _grid_velocity(trajectory, step_s)
     # Speeds are interpolated between key frames, but not across gaps with lost tracking
-    is_known = is_bracketed(grid, time, max(10.0 * median_interval(trajectory.time_s), 0.5))
+    is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(trajectory.time_s), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
-        rotations = Slerp(time, trajectory.rotation)(grid)
-        rates = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
-        rates = np.concatenate((rates, rates[-1:]))
-        sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
-        speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
+        rotations = Slerp(time_s, trajectory.rotation)(grid_s)
+        rates_rad_s = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
+        rates_rad_s = np.concatenate((rates_rad_s, rates_rad_s[-1:]))
+        sigma_samples = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
+        speeds.append(np.linalg.norm(gaussian_filter1d(rates_rad_s, sigma_samples, axis=0), axis=1))
     return speeds, is_known
 
 
@@ -277,8 +280,8 @@ class _OffsetFit:
     def misfit(self) -> float:
         """RMS of the residuals over RMS extent of the motion, to compare fits."""
         # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
-        extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
-        return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
+        extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
+        return max(self.rms_m / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
@@ -287,17 +290,17 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
     same effect as a time offset.
     """
-    n = len(fit.time_s)
+    pose_count = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
     sparse_velocity = fit.transform.rotation.apply(
         fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that a translation, a small rotation or a scale factor can explain
-    columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
+    columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
-    similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * n, 7)
-    velocities = np.stack((dense_velocity, sparse_velocity), axis=-1).reshape(3 * n, 2)
+    similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
+    velocities = np.stack((dense_velocity, sparse_velocity), axis=-1).reshape(3 * pose_count, 2)
     velocities = (
         velocities
         - similarity_columns @ np.linalg.lstsq(similarity_columns, velocities, rcond=None)[0]
@@ -308,14 +311,16 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
         or cross_information <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
     ):
         return float("inf")
-    score = (velocities[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
+    score = (velocities[:, 0].reshape(pose_count, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
     # The window of the weights must be longer than the correlation
-    lag_count = min(max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), n // 4)
+    lag_count = min(
+        max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), pose_count // 4
+    )
     weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
-    products = [float(score[k:] @ score[:-k]) for k in range(1, lag_count + 1)]
+    lagged_products = [float(score[k:] @ score[:-k]) for k in range(1, lag_count + 1)]
     own_variance = float(score @ score)
-    variance = max(own_variance + 2.0 * float(weights @ products), own_variance)
-    quantile = float(stdtrit(max(n / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
+    variance = max(own_variance + 2.0 * float(weights @ lagged_products), own_variance)
+    quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
     return float(quantile * np.sqrt(variance) / information)
 
 
@@ -333,29 +338,38 @@ def _refine_offset(
 
     Return None if too few poses overlap.
     """
-    time = sparse_track.time_s
+    sparse_time_s = sparse_track.time_s
     gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_track.time_s))
     # The same poses are used at every offset, so that the objective is continuous
     window_offsets = (lag_s + shift for shift in (-window_s, 0.0, window_s))
     is_known = np.all(
-        [is_bracketed(time + offset, dense_track.time_s, gap_limit_s) for offset in window_offsets],
+        [
+            is_bracketed(sparse_time_s + offset, dense_track.time_s, gap_limit_s)
+            for offset in window_offsets
+        ],
         axis=0,
     )
     pose_indices = np.flatnonzero(is_known)
     time_fraction = min(
-        1.0, float(dense_track.time_s[-1] - dense_track.time_s[0]) / float(time[-1] - time[0])
+        1.0,
+        float(dense_track.time_s[-1] - dense_track.time_s[0])
+        / float(sparse_time_s[-1] - sparse_time_s[0]),
     )
-    if len(pose_indices) < max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(time)):
+    if len(pose_indices) < max(
+        2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(sparse_time_s)
+    ):
         return None
     pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
-    time = time[pose_indices]
-    position = sparse_track.position_m[pose_indices]
+    sparse_time_s = sparse_time_s[pose_indices]
+    sparse_position_m = sparse_track.position_m[pose_indices]
 
     def fit_at(shift_s: float) -> _OffsetFit:
-        target = positions_at(dense_track, time + (lag_s + shift_s))
+        target_m = positions_at(dense_track, sparse_time_s + (lag_s + shift_s))
         # The sparse trajectory is transformed: a transformed target could get the scale zero
-        transform = umeyama(position, target, with_scale=True)
-        return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
+        transform = umeyama(sparse_position_m, target_m, with_scale=True)
+        return _OffsetFit(
+            lag_s + shift_s, transform, sparse_time_s, transform.apply(sparse_position_m), target_m
+        )
 
     def cost(shift_s: float) -> float:
         fit = fit_at(shift_s)

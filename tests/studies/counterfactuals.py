@@ -18,13 +18,13 @@ from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.flight.model import Unavailable
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Kind, make_scenario
+from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.scenario import ScenarioKind, make_scenario
 
 NIS_WITHIN, REJECTED_WITHIN, ERROR_WITHIN = 0.10, 0.03, 0.10
 # By fault of ``simulate``: PX4 parameter, correct value, sizes of the fault, and the factor
 # from the unit of the fault to that of the parameter
-KNOBS: dict[Kind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
+KNOBS: dict[ScenarioKind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
     "aisle": {
         "ekf2-noise": ("EKF2_EVP_NOISE", 0.1, (0.02, 0.03, 0.05, 0.2, 0.5, 1.0), 1.0),
         "ekf2-delay": ("EKF2_EV_DELAY", 0.0, (0.05, 0.1, 0.175, 0.25), 1e3),
@@ -38,10 +38,10 @@ KNOBS: dict[Kind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
     },
 }
 # Kind, seed, faults of the first and the second flight, predicted parameter and its value
-Pair = tuple[Kind, int, str, str, str, float]
+Pair = tuple[ScenarioKind, int, str, str, str, float]
 
 
-def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
+def pairs(seeds: int, kind: ScenarioKind = "aisle") -> Iterator[Pair]:
     """Yield pairs from the correct setting to each wrong one, and back."""
     for seed in range(1, seeds + 1):
         for mistake, (name, right, values, per_unit) in KNOBS[kind].items():
@@ -51,13 +51,13 @@ def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
                 yield kind, seed, wrong, "", name, right
 
 
-def opened(kind: Kind, seed: int, mistake: str) -> Model | Unavailable:
+def opened(kind: ScenarioKind, seed: int, mistake: str) -> Model | Unavailable:
     """Open the EKF2 model of a flight with a fault."""
     scenario = make_scenario(kind, seed=seed, passes=3)
-    return open_model(simulate_flight(scenario, parse((mistake,) if mistake else ())))
+    return open_model(simulate_flight(scenario, parse_mistakes((mistake,) if mistake else ())))
 
 
-def flown(kind: Kind, seed: int, mistake: str) -> WhatIf | Unavailable:
+def flown(kind: ScenarioKind, seed: int, mistake: str) -> WhatIf | Unavailable:
     """Replay EKF2 of a flight with a fault."""
     model = opened(kind, seed, mistake)
     return model if isinstance(model, Unavailable) else what_if(model, [])
@@ -91,7 +91,7 @@ def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
 
 def main() -> None:
     seeds, counts = int(sys.argv[1]) if len(sys.argv) > 1 else 3, dict[str, int]()
-    kind: Kind = "outdoor" if "outdoor" in sys.argv[2:] else "aisle"
+    kind: ScenarioKind = "outdoor" if "outdoor" in sys.argv[2:] else "aisle"
     with ProcessPoolExecutor() as pool:
         for (_, seed, first, then, *_), verdict, numbers in pool.map(tried, pairs(seeds, kind)):
             counts[verdict.split(":")[0]] = counts.get(verdict.split(":")[0], 0) + 1

@@ -42,7 +42,7 @@ from px4fuse.request import ComparisonRequest, WhatIfRequest
 from px4fuse.results import build
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -350,7 +350,9 @@ class Job(NamedTuple):
     def read(self) -> tuple[ComparisonRequest, Flight]:
         """Return the request and the flight."""
         if self.kind:
-            flight = simulate_flight(make_scenario(self.kind, seed=self.seed), parse(self.mistakes))
+            flight = simulate_flight(
+                make_scenario(self.kind, seed=self.seed), parse_mistakes(self.mistakes)
+            )
             return ComparisonRequest(log=flight.log.name), flight
         os.chdir(SHARED / "cases")  # arguments of cases are relative to it
         values = dict(tune_command.make_context("tune", list(self.arguments)).params)

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.core.record import Record, table
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
+from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
 # Kind of the flights of a class; for "mixed", aisle or loop is drawn for each student
 FlightKind = Literal["aisle", "loop", "mixed"]
@@ -28,10 +28,13 @@ MIN_SECRET_LENGTH = 16
 # First part of each HMAC message. Another label would change all flights, so that students could
 # not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
-# Fractions of flights with 0, 1 and 2 injected faults, unless --mistakes sets the number. The only
+# Fractions of flights with 0, 1 and 2 injected faults, by kind of flight. The only
 # possible injected fault of a loop is "open-end". Many loops have no injected fault, so that
 # students cannot guess "open-end"
-COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
+MISTAKE_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
+    "aisle": (0.1, 0.5, 0.4),
+    "loop": (0.4, 0.6),
+}
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
 # Range of the difficulty of an injected fault: smallest size that px4fuse detects, divided by the
@@ -102,7 +105,7 @@ class DrawingRules(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
+RULES_BY_KIND = table(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
 
 
 @dataclass(frozen=True)
@@ -151,8 +154,10 @@ def draw(
     SettingsError
         One flight cannot have this many injected faults.
     """
-    possible_kinds = COUNT_FRACTIONS if kind == "mixed" else (kind,)
-    max_count = min(len(COUNT_FRACTIONS[each]) for each in possible_kinds) - 1
+    possible_kinds = MISTAKE_COUNT_FRACTIONS if kind == "mixed" else (kind,)
+    max_count = (
+        min(len(MISTAKE_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
+    )
     if count is not None and not 0 <= count <= max_count:
         raise SettingsError(
             f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
@@ -162,7 +167,7 @@ def draw(
         kind = "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if count is None:
-        count = bisect(list(accumulate(COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
+        count = bisect(list(accumulate(MISTAKE_COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
     mistakes: list[AssignableMistake] = []
     rules = RULES_BY_KIND[kind]
     for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):

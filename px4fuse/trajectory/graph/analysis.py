@@ -76,8 +76,10 @@ def analyse_graph(
         gates = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
-    count = int(np.count_nonzero(is_closure))
-    if count > 1 and (count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust):
+    closure_count = int(np.count_nonzero(is_closure))
+    if closure_count > 1 and (
+        closure_count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust
+    ):
         progress(f"optimising: {SOLUTIONS[ROBUST]}")
         solutions[ROBUST] = solve(graph, robust=True, is_closure=is_closure)
     results = Graph(

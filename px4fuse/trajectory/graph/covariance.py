@@ -59,13 +59,13 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     if not len(tested_edges):
         return []
     chain = model.odometry_chain(graph, tested_edges)
-    first_node = graph.first[tested_edges]
-    second = graph.second[tested_edges]
-    first_pose = int(min(first_node.min(), second.min()))
-    chain_edges = chain[first_pose : int(max(first_node.max(), second.max()))]
+    first_nodes = graph.first[tested_edges]
+    second_nodes = graph.second[tested_edges]
+    first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
+    chain_edges = chain[first_pose_index : int(max(first_nodes.max(), second_nodes.max()))]
     missing_steps = np.flatnonzero(chain_edges < 0)
     if len(missing_steps):
-        vertex = first_pose + int(missing_steps[0])
+        vertex = first_pose_index + int(missing_steps[0])
         raise TrajectoryError(
             f"The closures cannot be tested, because no odometry edge connects vertices "
             f"{graph.ids[vertex]} and {graph.ids[vertex + 1]}",
@@ -80,17 +80,22 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
     chain_covariance = (
-        cumulative_covariance[np.maximum(first_node, second) - first_pose]
-        - cumulative_covariance[np.minimum(first_node, second) - first_pose]
+        cumulative_covariance[np.maximum(first_nodes, second_nodes) - first_pose_index]
+        - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
     )
-    to_end = lie.adjoint(lie.inverse(poses[second - first_pose]))
+    to_end = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
     covariance = to_end @ chain_covariance @ to_end.transpose(0, 2, 1)
-    relative = lie.between(poses[first_node - first_pose], poses[second - first_pose])
-    residual = lie.log(lie.between(graph.measurements[tested_edges], relative))
-    jacobian = lie.right_jacobian_inverse(residual)
+    relative_poses = lie.between(
+        poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
+    )
+    residuals = lie.log(lie.between(graph.measurements[tested_edges], relative_poses))
+    jacobian = lie.right_jacobian_inverse(residuals)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-    edge_residuals = zip(tested_edges.tolist(), residual, covariance, strict=True)
-    return [_test_edge(graph, edge_index, r, sigma) for edge_index, r, sigma in edge_residuals]
+    edge_tests = zip(tested_edges.tolist(), residuals, covariance, strict=True)
+    return [
+        _test_edge(graph, edge_index, edge_residual, edge_covariance)
+        for edge_index, edge_residual, edge_covariance in edge_tests
+    ]
 
 
 def _test_edge(

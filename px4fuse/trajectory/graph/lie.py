@@ -41,9 +41,9 @@ def rotation_matrix(pose: Array) -> Array:
     return _rotation_of(pose).as_matrix()
 
 
-def identity(width: int) -> Array:
-    """Return the identity pose; ``width`` is 3 for SE(2) and 7 for SE(3)."""
-    pose = np.zeros(width)
+def identity(pose_length: int) -> Array:
+    """Return the identity pose; ``pose_length`` is 3 for SE(2) and 7 for SE(3)."""
+    pose = np.zeros(pose_length)
     pose[6:] = 1.0  # the identity rotation has w = 1
     return pose
 
@@ -146,15 +146,15 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator = _commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
-    c = _cot_term(theta)
-    slope = 0.5 * _cot_term_slope(theta)
+    cot_term = _cot_term(theta)
+    half_cot_slope = 0.5 * _cot_term_slope(theta)
     # Series of x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
-        + (c - theta * theta * slope) * commutator_squared
+        + (cot_term - theta * theta * half_cot_slope) * commutator_squared
     )
-    return jacobian - slope * (commutator_squared @ commutator_squared)
+    return jacobian - half_cot_slope * (commutator_squared @ commutator_squared)
 
 
 def _commutator(tangent: Array) -> Array:

@@ -13,10 +13,9 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a direction that is
-# measured
+# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a measured direction
 MIN_OBSERVED_EIGENVALUE = 1e-9
-# Sources of the initial poses
+# Sources of the initial poses of a pose graph
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "composed odometry edges"
 FROM_CHORDAL = "chordal initialisation"
@@ -39,7 +38,7 @@ class PoseGraph:
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
     information: Array
-    # Source of the poses
+    # Source of the initial poses
     initialised: str = FROM_FILE
 
     __repr__ = one_line_repr
@@ -104,9 +103,9 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     different units, so the matrix is scaled to unit diagonal first.
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
-    values, vectors = np.linalg.eigh(scaled_information)
-    is_observed = values > MIN_OBSERVED_EIGENVALUE
-    return scale[:, None] * vectors[:, is_observed], 1.0 / values[is_observed]
+    eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
+    is_observed = eigenvalues > MIN_OBSERVED_EIGENVALUE
+    return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:

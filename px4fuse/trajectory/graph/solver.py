@@ -15,29 +15,28 @@ from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equat
 MAX_ITERATIONS = 100
 # Initial damping of Levenberg-Marquardt, as in GTSAM
 _INITIAL_DAMPING = 1e-5
-# Factor on the damping after a rejected step, as in GTSAM
+# Factor on the damping of Levenberg-Marquardt after a rejected step, as in GTSAM
 _DAMPING_FACTOR = 10.0
-# Maximum damping, as in GTSAM
+# Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
-# Minimum ratio of the decrease of the cost to its predicted decrease for accepting a step, as in
-# GTSAM
+# Minimum ratio of actual to predicted decrease of the cost for accepting a step, as in GTSAM
 _MIN_FIDELITY = 1e-3
-# Tolerance of the cost, relative and absolute
-_TOLERANCE = 1e-10
+# Relative and absolute tolerance of the cost of a pose graph
+_COST_TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# Tolerance in the intermediate stages of graduated non-convexity, which need less precision
+# Relative tolerance of the cost in an intermediate stage of graduated non-convexity
 _STAGE_TOLERANCE = 1e-6
 # Maximum number of iterations in an intermediate stage of graduated non-convexity
-_STAGE_ITERATIONS = 20
+_MAX_STAGE_ITERATIONS = 20
 
-# Probability that the squared residual of a true closure is not truncated
+# Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
 # Probability that the cost of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
-_GNC_FACTOR = 1.4
+_GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-# Maximum number of dropped closures that are tested again: each test is a minimisation
+# Maximum number of dropped closures that are tested again, each by an optimisation
 _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
 
@@ -117,14 +116,14 @@ def _minimise(
     graph: PoseGraph,
     state: Residuals,
     weights: Array,
-    tolerance: float = _TOLERANCE,
+    tolerance: float = _COST_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Minimum:
     """Minimise the cost from ``state``, like GTSAM's LevenbergMarquardtOptimizer."""
     damping = _INITIAL_DAMPING
     iterations = 0
     cost = float(np.sum(0.5 * weights * state.chi2))
-    while iterations < max_iterations and cost > _TOLERANCE:
+    while iterations < max_iterations and cost > _COST_TOLERANCE:
         # d r / d x_j = J, d r / d x_i = -J A, with A the adjoint of x_i relative to x_j
         jacobian = lie.right_jacobian_inverse(state.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(state.relative))
@@ -162,9 +161,9 @@ def _minimise(
         cost = cost - cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
-        if cost_decrease <= max(tolerance * cost_before, _TOLERANCE):
+        if cost_decrease <= max(tolerance * cost_before, _COST_TOLERANCE):
             return _Minimum(state, iterations, True)
-    return _Minimum(state, iterations, cost <= _TOLERANCE)
+    return _Minimum(state, iterations, cost <= _COST_TOLERANCE)
 
 
 def _solve_gnc(
@@ -178,10 +177,12 @@ def _solve_gnc(
     degrees_of_freedom = np.sum(
         np.linalg.eigvalsh(scaled_information) > model.MIN_OBSERVED_EIGENVALUE, axis=1
     )
-    bound = np.full(len(is_doubtful), np.inf)
+    chi2_bound = np.full(len(is_doubtful), np.inf)
     drop_cost = np.zeros(len(is_doubtful))
     is_testable = is_doubtful & (degrees_of_freedom > 0)
-    bound[is_testable] = 2.0 * gammaincinv(degrees_of_freedom[is_testable] / 2.0, GNC_PROBABILITY)
+    chi2_bound[is_testable] = 2.0 * gammaincinv(
+        degrees_of_freedom[is_testable] / 2.0, GNC_PROBABILITY
+    )
     drop_cost[is_testable] = 2.0 * gammaincinv(
         degrees_of_freedom[is_testable] / 2.0, DROP_PROBABILITY
     )
@@ -192,50 +193,58 @@ def _solve_gnc(
     iteration_count = plain_minimum.iterations
     solutions = []
     for start_state in (plain_minimum.state, start):
-        minimum, weights = _descend_graduated(graph, start_state, bound)
+        minimum, weights = _descend_graduated(graph, start_state, chi2_bound)
         iteration_count += minimum.iterations
         solutions.append((truncated_cost(minimum.state, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
-    dropped = np.flatnonzero(weights == 0.0)
-    for edge_index in dropped[np.argsort(minimum.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
+    dropped_edges = np.flatnonzero(weights == 0.0)
+    for edge_index in dropped_edges[np.argsort(minimum.state.chi2[dropped_edges])][
+        :_MAX_RETRIED_CLOSURES
+    ]:
         trial_weights = weights.copy()
         trial_weights[edge_index] = 1.0
-        retried = _minimise(graph, minimum.state, trial_weights)
-        iteration_count += retried.iterations
-        if (cost := truncated_cost(retried.state, trial_weights)) < lowest_cost:
+        retried_minimum = _minimise(graph, minimum.state, trial_weights)
+        iteration_count += retried_minimum.iterations
+        if (cost := truncated_cost(retried_minimum.state, trial_weights)) < lowest_cost:
             lowest_cost = cost
-            minimum = retried
+            minimum = retried_minimum
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
     return _Minimum(minimum.state, iteration_count, minimum.converged), weights
 
 
-def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
+def _descend_graduated(
+    graph: PoseGraph, start: Residuals, chi2_bound: Array
+) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state = start
     iteration_count = 0
     # Edges that cannot be false have an infinite bound, so their excess is -1
-    chi2_excess = 2.0 * state.chi2 / bound - 1.0
+    chi2_excess = 2.0 * state.chi2 / chi2_bound - 1.0
     if np.max(chi2_excess) > 0.0:
-        control = 1.0 / float(np.max(chi2_excess))
+        gnc_control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
             # avoids a division by zero; the weight is 1 anyway
-            ratio = np.maximum(state.chi2 / bound, 1e-200)
-            weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
-            stage_minimum = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
+            ratio = np.maximum(state.chi2 / chi2_bound, 1e-200)
+            weights = np.clip(
+                np.sqrt(gnc_control * (gnc_control + 1.0) / ratio) - gnc_control, 0.0, 1.0
+            )
+            stage_minimum = _minimise(
+                graph, state, weights, _STAGE_TOLERANCE, _MAX_STAGE_ITERATIONS
+            )
             state = stage_minimum.state
             iteration_count = iteration_count + stage_minimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
-            control *= _GNC_FACTOR
-    weights = (state.chi2 <= bound).astype(float)
+            gnc_control *= _GNC_CONTROL_FACTOR
+    weights = (state.chi2 <= chi2_bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
-        minimum_state = _minimise(graph, state, weights)
-        state = minimum_state.state
-        iteration_count = iteration_count + minimum_state.iterations
+        truncated_minimum = _minimise(graph, state, weights)
+        state = truncated_minimum.state
+        iteration_count = iteration_count + truncated_minimum.iterations
         # Each round decreases the truncated cost, so the iteration ends
-        new_weights = (state.chi2 <= bound).astype(float)
+        new_weights = (state.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(state, iteration_count, minimum_state.converged), weights
+    return _Minimum(state, iteration_count, truncated_minimum.converged), weights

@@ -13,10 +13,10 @@ from px4fuse.trajectory.graph.model import PoseGraph
 
 # Option relax of SuperLU: 1 gives the least fill-in. With a value above the default of 10, SuperLU
 # writes outside its workspace (scipy 1.17, shown by valgrind)
-_RELAX = 1
+_SUPERLU_RELAX = 1
 # Option panel_size of SuperLU. With a value above the default of 20, SuperLU also writes outside
 # its workspace
-_PANEL = 4
+_SUPERLU_PANEL_SIZE = 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
 
@@ -74,8 +74,8 @@ def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0
             # MMD_AT_PLUS_A has 1.1 to 1.9 times less fill-in than COLAMD on public benchmark graphs
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
-            relax=_RELAX,
-            panel_size=_PANEL,
+            relax=_SUPERLU_RELAX,
+            panel_size=_SUPERLU_PANEL_SIZE,
             options={"SymmetricMode": True},
         )
     except RuntimeError:  # exactly singular
