@@ -148,7 +148,7 @@ def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
         (ratios, "no change: the reported σ is consistent"),
         (
             untested,
-            "no change: the log has no ground truth, which would show this fault",
+            "no change: only ground truth shows this fault, and the log has none",
         ),
     ):
         cause = make_cause(analysis(), ranked, evaluated, REQUEST)

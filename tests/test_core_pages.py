@@ -78,8 +78,8 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
 
 def test_event_symbols_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    visible = event_marks.visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
-    assert len(visible) <= 1.0 / event_marks.MIN_MARK_DISTANCE + 1.0
+    visible = event_marks.visible_times(time_s, 3600.0 * event_marks.MIN_MARK_INTERVAL_FRACTION)
+    assert len(visible) <= 1.0 / event_marks.MIN_MARK_INTERVAL_FRACTION + 1.0
     assert set(visible) <= set(time_s)
 
 
@@ -88,7 +88,7 @@ def test_zoomed_plot_window_avoids_position_gap() -> None:
     comparison = compare(made)
     start, end = flight.zoom_window(comparison.main, comparison.segment)
     updates = comparison.main.replay.updates.index
-    assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATES + 1
+    assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATE_COUNT + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
     sentence = panels.sigma_sentence(unexplained(comparison), comparison.main)

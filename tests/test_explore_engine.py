@@ -18,7 +18,7 @@ from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
-from px4fuse.explore.data import OFFSET_HALF_RANGE_S, raw_source, replay_signals
+from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, raw_source, replay_signals
 from px4fuse.explore.packing import FINE_SCALE, Packer
 from px4fuse.filter.kalman import Replay, replay, state_at
 from px4fuse.filter.settings import Settings
@@ -97,7 +97,9 @@ def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
 
 def some_settings(rng: np.random.Generator, imu: bool) -> Settings:
     a, z, dt = np.exp(rng.uniform(np.log([1e-3, 1e-3, 0.02]), np.log([50.0, 5.0, 1.0]))).tolist()
-    offset = 0.0 if rng.random() < 0.2 else float(rng.uniform(-1.0, 1.0)) * OFFSET_HALF_RANGE_S
+    offset = (
+        0.0 if rng.random() < 0.2 else float(rng.uniform(-1.0, 1.0)) * OFFSET_SLIDER_HALF_RANGE_S
+    )
     if rng.random() < 0.3:  # a grid that contains the measurement times
         dt, offset = float(rng.choice([0.1, 0.2, 0.05])), round(offset, 1)
     return Settings(a, z, dt, "imu" if imu and rng.random() < 0.8 else "zero", offset)

@@ -15,7 +15,7 @@ from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import axis_fraction
-from px4fuse.card.verdicts import verdicts
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
@@ -148,7 +148,7 @@ def test_explore_page_sigma_ratios_after_change_equal_python(
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
     main = compare_prepared(prepare_comparison(request, flight=analysis.flight)).main
-    source, truth = verdicts(main)[:2]
+    source, truth = make_sigma_verdicts(main)[:2]
     rows = page.ask(ROWS)
     for verdict in (source, truth):
         assert rows[f"kf {verdict.against}"][:2] == [format_ratio(verdict.ratio), verdict.word]

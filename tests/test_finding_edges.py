@@ -64,7 +64,7 @@ from px4fuse.findings import (
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import (
     SOURCE_WORDS,
-    fraction_on,
+    fraction_of_ones,
     spans_with_value,
     zero_length_spans,
 )
@@ -107,8 +107,8 @@ def test_finding_text_lists_times_of_its_occurrence(spans: Any, expected: str) -
 
 def test_status_flag_before_first_sample_has_first_value() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
-    assert fraction_on(flag, whole) == 0.5
-    assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
+    assert fraction_of_ones(flag, whole) == 0.5
+    assert fraction_of_ones(flag, Segment(25.0, 35.0, "")) == 0.5
     assert spans_with_value(0.0, flag, whole) == ((30.0, 80.0),)
     assert spans_with_value(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
     assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
@@ -448,7 +448,7 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
     rate_hz: float, least_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
-        monkeypatch.setattr(source_intervals, "state_errors_after", lambda *_: "Errors.")
+        monkeypatch.setattr(source_intervals, "describe_errors_after_gap", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         gaps = source_gaps(time, rate_hz)
         one = analysis(
@@ -853,7 +853,7 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
 
 def test_sample_interval_is_found_despite_jitter() -> None:
     def base(intervals: Any) -> float | None:
-        found = source_intervals._base_interval(np.array(intervals))
+        found = source_intervals._find_period(np.array(intervals))
         return None if found is None else found[0]
 
     assert base([1.0, 1.0, 2.0]) == 1.0

@@ -25,7 +25,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.model import AidLog, Ekf2, Flight, FusionRecord
 from px4fuse.readers import read_log
 from px4fuse.report.difference_page import format_agreement
-from px4fuse.report.whatif import rows
+from px4fuse.report.whatif import statistic_rows
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
@@ -507,7 +507,7 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     jsonschema.validate(results, schema())
     assert results["whatif"]["heights"].keys() == {"baro_hgt"}
     assert results["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
-    shown = {row[0]: row[1:] for row in rows(found)}
+    shown = {row[0]: row[1:] for row in statistic_rows(found)}
     assert shown["GNSS height: mean NIS"][-1] == "n/a"
     row = next(row for label, row in shown.items() if label.startswith("height RMSE"))
     assert row == [

@@ -28,8 +28,7 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
-from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED, NOTICE, PROMPTS, Server
+from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED_ANSWERS, NOTICE, PROMPTS, Server
 from px4fuse.results.contract import schema, to_json
 
 # Command of px4fuse for each tool that analyses a file
@@ -404,7 +403,7 @@ def test_server_writes_files_only_to_output_folder(tmp_path: Path) -> None:
 
 @pytest.mark.process
 def test_answer_is_computed_again_if_the_log_changed(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("px4fuse.mcp.server.MAX_CACHED", 1)
+    monkeypatch.setattr("px4fuse.mcp.server.MAX_CACHED_ANSWERS", 1)
     log, server = tmp_path / "l.ulg", in_process(tmp_path)
 
     async def talk(client: Client) -> None:
@@ -414,7 +413,7 @@ def test_answer_is_computed_again_if_the_log_changed(tmp_path: Path, monkeypatch
             answer = await client.call_tool("info", {"log": "l.ulg"})
             hashes.append(answer.structured_content["log"]["sha256"])
         assert hashes[0] == hashes[1] != hashes[2]
-        assert len(server._cache) == 1 < MAX_CACHED
+        assert len(server._cache) == 1 < MAX_CACHED_ANSWERS
 
     connect(server, talk)
 

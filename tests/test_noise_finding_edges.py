@@ -345,7 +345,10 @@ def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind
 
 def test_filter_rerun_without_improvement_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
-    for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
+    for after, action in (
+        (1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."),
+        (9.0, noises.UNEXPLAINED_SIGMA),
+    ):
         one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
             tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
         assert only(noises.detect_inconsistent_variances, one).remedy == action
@@ -356,7 +359,7 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.NOT_EXPLAINED)
+    assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.UNEXPLAINED_SIGMA)
     unknown = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),)))
     assert unknown.remedy == noises.UNKNOWN_NOISE
 

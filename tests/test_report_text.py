@@ -214,17 +214,17 @@ def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
         SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
     ]
     nothing: Any = SimpleNamespace(findings=[])
-    assert "no significant time offset" in clock.summary_line(fine, [])
+    assert "no significant time offset" in clock.summarise_offset(fine, [])
     assert not list(clock.draw(fine, nothing))
     for analysis, results in (
         (with_clock(unknown), nothing), *((fine, each) for each in with_finding)
     ):  # fmt: skip
-        line = clock.summary_line(analysis, results.findings)
+        line = clock.summarise_offset(analysis, results.findings)
         assert line == "The appendix on the time offset contains the estimate."
         assert len(list(clock.draw(analysis, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
     assert (
-        clock.summary_line(none, [])
+        clock.summarise_offset(none, [])
         == "The time offset cannot be estimated: no IMU. Give the ULog."
     )
     assert not list(clock.draw(none, nothing))

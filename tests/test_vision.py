@@ -32,7 +32,7 @@ from px4fuse.findings import find
 from px4fuse.flight.model import AidLog, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.flight.position_source import RECEIVED
 from px4fuse.report.difference_page import format_agreement
-from px4fuse.report.whatif import rows
+from px4fuse.report.whatif import statistic_rows
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
@@ -485,7 +485,7 @@ def test_what_if_vision_noise_equals_flight_with_this_noise() -> None:
 def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
-    found, update_log = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
+    found, update_log = made_of.whatif, {label: cells for label, *cells in statistic_rows(made_of)}
     assert "external vision, position: mean NIS" in update_log
     results = json.loads(to_json(whatif_results(request, made_of)))
     jsonschema.validate(results, schema())

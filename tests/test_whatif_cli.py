@@ -18,9 +18,9 @@ from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.report.whatif import (
-    NOT_PREDICTABLE,
+    NOT_PREDICTABLE_TEXT,
     column_heads,
-    rows,
+    statistic_rows,
     summary,
     sweep_notes,
     sweep_table,
@@ -96,7 +96,10 @@ def test_whatif_command_without_set_keeps_parameters_that_fit(estimated: WhatIfA
     assert not estimated.whatif.whatif
     texts = [str(block) for block in summary(estimated).blocks]
     assert any("no parameter is changed" in text for text in texts)
-    table, found = {label.strip(): cells for label, *cells in rows(estimated)}, estimated.whatif
+    table, found = (
+        {label.strip(): cells for label, *cells in statistic_rows(estimated)},
+        estimated.whatif,
+    )
     every = (found.logged, found.replayed)
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
     assert table["samples"] == [str(s.samples) for s in every]
@@ -191,10 +194,10 @@ def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) 
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")
     told = run_what_if(request, flight=sample_flight)
-    table = rows(told)
-    assert {line[3] for line in table} == {NOT_PREDICTABLE}
-    assert all(NOT_PREDICTABLE not in line[:3] for line in table)
-    assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE] * 2
+    table = statistic_rows(told)
+    assert {line[3] for line in table} == {NOT_PREDICTABLE_TEXT}
+    assert all(NOT_PREDICTABLE_TEXT not in line[:3] for line in table)
+    assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
     said = " ".join(sweep_notes(told))
     assert "not predictable if more than 35% of the samples would be rejected" in said
     assert "2 mm of position noise would change it" in said

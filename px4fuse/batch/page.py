@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
-from px4fuse.card.model import AXIS_ENDS
+from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.core.text import format_metres, format_number, format_ratio, join_first
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.findings import finding_title
@@ -114,7 +114,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={"bands": CONSISTENT_RATIOS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
+        ratio_axis={"bands": CONSISTENT_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARK_PATHS},
     )
 
 

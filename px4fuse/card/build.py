@@ -34,7 +34,7 @@ from px4fuse.card.model import (
     Note,
     Verdict,
 )
-from px4fuse.card.verdicts import verdicts as make_verdicts
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
 from px4fuse.comparison.projection import project_horizon
@@ -58,17 +58,17 @@ from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line,
 
 MAX_ACTIONS = 3
 KF_SETTINGS = {"sigma_a_m_s2": "SIGMA_A", "sigma_z_m": "SIGMA_Z", "dt_s": "DT"}
-# Minimum fraction of rejected positions that the card reports
-MIN_NAMED_REJECTION = 0.01
-BETTER_POSITION = ("position and σ", "position")
+# Minimum fraction of positions rejected by EKF2 that the diagnosis card states
+MIN_NAMED_REJECTED_FRACTION = 0.01
+POSITION_IMPROVEMENTS = ("position and σ", "position")
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
     "A σ that is too large against the source is not a fault here: the source may drift, and "
     "innovations do not show drift. Do not reduce noise settings because of it."
 )
-SHOWN_BYTE_COUNT = 4  # number of bytes at the start of an unreadable log that the card shows
-ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
+HEAD_BYTE_COUNT = 4  # number of printed bytes from the start of an unreadable log
+ULOG_HEAD_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_HIDES_ERROR = (
     "KF and EKF2 rotate the measured acceleration by the wrong heading. Each update corrects the "
     "position, so innovations show little of the position error."
@@ -79,7 +79,7 @@ UNEXPLAINED_DIFFERENCE = (
 WITHHELD_HEADLINE = "Assignment: the student makes the diagnosis, so px4fuse prints none"
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
 # Explanation of different verdicts against source and ground truth, by ids of findings
-SENTENCES_BY_SOURCE_FAULT = (
+SENTENCES_BY_SOURCE_FAULTS = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
         "KF uses the corrected axes, unit and orientation of the source. EKF2 used them as sent.",
@@ -105,32 +105,36 @@ def build_card(
     The recommended commands contain the options of ``request``. ``student``: name and id.
     """
     source, segment = analysis.source, analysis.segment
-    identity = _identity(
+    identity = _make_identity(
         analysis.flight.log,
         request,
         student,
         source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
-        settings=_settings(analysis, request),
-        changed=_changed_settings(request),
-        parameters=_changed_parameters(analysis),
+        settings=_settings_text(analysis, request),
+        changed=_changed_setting_texts(request),
+        parameters=_changed_parameter_texts(analysis),
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
     )
     if analysis.flight.log.is_assessed:
         return Card(severity="note", headline=WITHHELD_HEADLINE, identity=identity)
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
-    verdicts = make_verdicts(analysis.main)
+    sigma_verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, root_findings)
     causes = tuple(
-        make_cause(analysis, ranked_finding, verdicts, request)
+        make_cause(analysis, ranked_finding, sigma_verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
     )
-    may_drift = source.origin.may_drift
-    verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
+    may_source_drift = source.origin.may_drift
+    sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_source_drift)
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
-        verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(analysis, verdicts, causes)
-    if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
+        sigma_verdicts = (*sigma_verdicts[:-1], replace(sigma_verdicts[-1], is_explained=True))
+    reconcile = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
+    if (
+        not reconcile
+        and any(verdict.is_explained for verdict in sigma_verdicts)
+        and may_source_drift
+    ):
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
         reconcile = (
@@ -139,17 +143,19 @@ def build_card(
             f"{format_ratio(horizon_ratio)} times σ: consistent."
         )
     elif reconcile == UNEXPLAINED_DIFFERENCE:
-        verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
+        sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     effect = _make_effect(analysis)
-    severity: CardSeverity = "note" if any(verdict.is_fault for verdict in verdicts) else "clean"
+    severity: CardSeverity = (
+        "note" if any(verdict.is_fault for verdict in sigma_verdicts) else "clean"
+    )
     return Card(
         severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
-        headline=_headline(causes, verdicts),
+        headline=_make_headline(causes, sigma_verdicts),
         effect=effect,
-        effect_text=_effect_text(analysis, effect, verdicts),
+        effect_text=_effect_text(analysis, effect, sigma_verdicts),
         do_this=_action_sentences(causes),
-        verdicts=verdicts,
+        verdicts=sigma_verdicts,
         reconcile=reconcile,
         difference=_difference_text(effect, ranked_causes),
         causes=causes,
@@ -186,7 +192,7 @@ def build_aids_card(
             for name, axis in aid.axes.items()
         ),
         facts={"KF": f"not run: {missing_data.reason}. {with_options(missing_data.remedy)}"},
-        identity=_identity(analysis.flight.log, request, student, source="no position source"),
+        identity=_make_identity(analysis.flight.log, request, student, source="no position source"),
     )
 
 
@@ -194,10 +200,11 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the diagnosis card of a log that cannot be analysed: fault and fix."""
     facts = {}
     with suppress(LogError):  # the headline states the reason if the file cannot be read
-        first_bytes = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
+        first_bytes = read_head(path, HEAD_BYTE_COUNT, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
         facts["read"] = (
-            f"{size_bytes:,} bytes; the file begins with {first_bytes}, a ULog with {ULOG_HEAD}"
+            f"{size_bytes:,} bytes; the file begins with {first_bytes}, a ULog with "
+            f"{ULOG_HEAD_BYTES}"
         )
     if error.remedy:
         facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
@@ -210,7 +217,7 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     )
 
 
-def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
+def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -> str:
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
@@ -218,18 +225,21 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
             if further_cause.severity == "error" and len(joined_titles) <= MAX_HEADLINE_LENGTH:
                 return joined_titles
         return main_cause.title
-    if faulty := [verdict for verdict in verdicts if verdict.is_fault]:
-        worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
-        ratio = worst.ratio or 1.0
+    if fault_verdicts := [verdict for verdict in sigma_verdicts if verdict.is_fault]:
+        worst_verdict = max(fault_verdicts, key=lambda verdict: abs(math.log(verdict.ratio or 1.0)))
+        ratio = worst_verdict.ratio or 1.0
         direction = "small" if ratio > 1.0 else "large"
-        factor = format_ratio(max(ratio, 1.0 / ratio))
+        factor_text = format_ratio(max(ratio, 1.0 / ratio))
         return (
-            f"{FILTER_NAMES[worst.filter]} {worst.word}: σ {factor} times too {direction} against "
-            f"{'the source' if worst.against == 'source' else 'ground truth'}"
+            f"{FILTER_NAMES[worst_verdict.filter]} {worst_verdict.word}: σ {factor_text} times too "
+            f"{direction} against "
+            f"{'the source' if worst_verdict.against == 'source' else 'ground truth'}"
         )
-    if all(each.word == "not evaluated" for each in verdicts):
+    if all(verdict.word == "not evaluated" for verdict in sigma_verdicts):
         return "No fault found; KF and EKF2 could not be evaluated"
-    consistent_filters = {each.filter for each in verdicts if each.word == "consistent"}
+    consistent_filters = {
+        verdict.filter for verdict in sigma_verdicts if verdict.word == "consistent"
+    }
     return (
         NO_FAULT_HEADLINE
         if len(consistent_filters) == 2
@@ -239,10 +249,12 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 def _make_effect(analysis: Analysis) -> Effect:
     result, difference = analysis.main, analysis.main.difference
-    reset_count, flight = None, analysis.segment.flight
+    reset_count, flight_segment = None, analysis.segment.flight
     if isinstance(analysis.flight.ekf2, Ekf2):
         resets_s = horizontal_resets_s(analysis.flight.ekf2)
-        reset_count = int(((flight.start_s < resets_s) & (resets_s <= flight.end_s)).sum())
+        reset_count = int(
+            ((flight_segment.start_s < resets_s) & (resets_s <= flight_segment.end_s)).sum()
+        )
     return Effect(
         axis=describe_axis(analysis, result),
         position_rmse_m=_position_rmse_m(result),
@@ -267,8 +279,8 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
 def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
     return {
         filter_name: truth.position_rmse_m
-        for filter_name, statement in result.filters.items()
-        if isinstance(truth := statement.truth, ErrorsAgainstTruth)
+        for filter_name, summary in result.filters.items()
+        if isinstance(truth := summary.truth, ErrorsAgainstTruth)
     }
 
 
@@ -280,22 +292,24 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     return {name: math.hypot(north_m[name], east_m[name]) for name in north_m if name in east_m}
 
 
-def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
+def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
-    is_part = max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
-    span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
+    is_part_of_flight = (
+        max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
+    )
+    span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part_of_flight else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
-        horizontal = _lengths_by_filter(effect.horizontal_rmse_m)
-        horizontal = f" (horizontal: {horizontal})" if horizontal else ""
+        horizontal_text = _lengths_by_filter(effect.horizontal_rmse_m)
+        horizontal_text = f" (horizontal: {horizontal_text})" if horizontal_text else ""
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{span_text}: "
-            f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal}."
+            f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal_text}."
         )
-        for verdict in verdicts:
+        for verdict in sigma_verdicts:
             if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
                 sentences.append(
                     f"The position error of {FILTER_NAMES[verdict.filter]} is "
@@ -303,7 +317,8 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
                 )
         sentences += _worst_axis_sentences(analysis)
     if effect.difference_rms_m is not None and (
-        not effect.position_rmse_m or all(each.word == "consistent" for each in verdicts)
+        not effect.position_rmse_m
+        or all(verdict.word == "consistent" for verdict in sigma_verdicts)
     ):
         sentences.append(
             f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS."
@@ -314,7 +329,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
         )
     if (
         rejected_fraction := effect.rejected_fraction
-    ) is not None and rejected_fraction >= MIN_NAMED_REJECTION:
+    ) is not None and rejected_fraction >= MIN_NAMED_REJECTED_FRACTION:
         sentences.append(f"EKF2 rejected {format_percent(rejected_fraction)} of the positions.")
     if effect.horizontal_resets:
         reset_count = format_count(effect.horizontal_resets)
@@ -323,23 +338,25 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    errors = {
+    errors_by_axis = {
         result.axis.label: truth
         for result in analysis.secondary_axes
         if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
         and truth.nees_position_mean
         and not truth.is_lag_only
     }
-    if not errors:
+    if not errors_by_axis:
         return []
-    label, worst = max(errors.items(), key=lambda item: item[1].nees_position_mean or 0.0)
-    ratio = math.sqrt(worst.nees_position_mean or 0.0)
+    axis_label, worst_errors = max(
+        errors_by_axis.items(), key=lambda item: item[1].nees_position_mean or 0.0
+    )
+    ratio = math.sqrt(worst_errors.nees_position_mean or 0.0)
     main_truth = analysis.main.filters["ekf2"].truth
     main_nees = 0.0 if isinstance(main_truth, Unavailable) else main_truth.nees_position_mean or 0.0
     if classify_sigma_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
         return []
     return [
-        f"EKF2's RMSE along {label} is {format_metres(worst.position_rmse_m)} m, "
+        f"EKF2's RMSE along {axis_label} is {format_metres(worst_errors.position_rmse_m)} m, "
         f"{format_ratio(ratio)} times its reported σ."
     ]
 
@@ -352,7 +369,7 @@ def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
-    texts: list[str] = []
+    numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
         sentences = [
             _action_sentence(action)
@@ -360,11 +377,20 @@ def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
             if action.commands or not action.sentence.startswith("no ")
         ]
         if cause.alternatives:
-            either = [_action_sentence(action) for group in cause.alternatives for action in group]
-            sentences.insert(0, ", or ".join([*(text[:-1] for text in either[:-1]), either[-1]]))
+            alternative_sentences = [
+                _action_sentence(action) for group in cause.alternatives for action in group
+            ]
+            sentences.insert(
+                0,
+                ", or ".join(
+                    [*(text[:-1] for text in alternative_sentences[:-1]), alternative_sentences[-1]]
+                ),
+            )
         label = f"({number}) " if len(causes) > 1 else ""
-        texts += [f"{label}{sentence}" for sentence in sentences]
-    return tuple(dict.fromkeys(texts))[:MAX_ACTIONS] if causes else ("Change nothing.",)
+        numbered_sentences += [f"{label}{sentence}" for sentence in sentences]
+    return (
+        tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS] if causes else ("Change nothing.",)
+    )
 
 
 def _action_sentence(action: Action) -> str:
@@ -381,32 +407,32 @@ def _action_sentence(action: Action) -> str:
 
 
 def _mark_explained(
-    verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
+    sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
     """Mark inconsistent verdicts on filters that need no change."""
-    unchanged = {
+    unchanged_filters = {
         name
         for cause in causes
         for action in cause.actions
         if action.sentence.startswith("no change")
         for name in action.target.split(", ")
     }
-    truth_is_right = {
+    filters_consistent_with_truth = {
         verdict.filter
-        for verdict in verdicts
+        for verdict in sigma_verdicts
         if verdict.against == "truth" and verdict.word == "consistent"
     }
     return tuple(
         replace(verdict, is_explained=True)
         if verdict.is_fault
         and (
-            FILTER_NAMES[verdict.filter] in unchanged
-            or verdict.filter in truth_is_right
+            FILTER_NAMES[verdict.filter] in unchanged_filters
+            or verdict.filter in filters_consistent_with_truth
             # drift does not change innovations, so a small NIS is not a fault
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
-        for verdict in verdicts
+        for verdict in sigma_verdicts
     )
 
 
@@ -416,58 +442,65 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     The published position contains the lag of EKF2's output predictor, which σ does not include.
     """
     result, ekf2 = analysis.main, analysis.flight.ekf2
-    published_verdict = make_verdicts(result)[-1]
+    published_verdict = make_sigma_verdicts(result)[-1]
     if published_verdict.word != "overconfident" or not isinstance(ekf2, Ekf2):
         return None
-    horizon = project_horizon(ekf2, result.axis, analysis.segment)
-    if horizon is None or not isinstance(result.truth, pd.DataFrame):
+    horizon_track = project_horizon(ekf2, result.axis, analysis.segment)
+    if horizon_track is None or not isinstance(result.truth, pd.DataFrame):
         return None
     true_m = result.truth["position_m"]
-    error_m = horizon["position_m"] - np.interp(horizon.index, true_m.index, true_m, np.nan, np.nan)
-    nees = float(np.nanmean(np.square(error_m) / horizon["position_variance_m2"]))
+    error_m = horizon_track["position_m"] - np.interp(
+        horizon_track.index, true_m.index, true_m, np.nan, np.nan
+    )
+    nees = float(np.nanmean(np.square(error_m) / horizon_track["position_variance_m2"]))
     ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
     return ratio if classify_sigma_ratio(ratio, "truth") == "consistent" else None
 
 
-def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> str:
-    corrected = {
+def _explain_differing_verdicts(
+    analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause]
+) -> str:
+    corrected_filters = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
         for rerun in cause.reruns
         if rerun.improves == "position and σ"
     }
-    differing = [
+    differing_filters = [
         filter_name
         for filter_name in FILTER_NAMES
-        for source, truth in [[verdict for verdict in verdicts if verdict.filter == filter_name]]
+        for source, truth in [
+            [verdict for verdict in sigma_verdicts if verdict.filter == filter_name]
+        ]
         if source.ratio is not None
         and truth.ratio is not None
         and (
             source.word != truth.word
-            or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected)
+            or (truth.ratio > 2.0 * source.ratio and filter_name not in corrected_filters)
         )
     ]
-    if not differing:
+    if not differing_filters:
         return ""
     finding_ids = {finding.id for finding in analysis.findings}
-    for ids_of_source, sentence in SENTENCES_BY_SOURCE_FAULT:
-        if not finding_ids.isdisjoint(ids_of_source):
+    for fault_ids, sentence in SENTENCES_BY_SOURCE_FAULTS:
+        if not finding_ids.isdisjoint(fault_ids):
             return sentence
-    if corrected.issuperset(differing):
-        filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
+    if corrected_filters.issuperset(differing_filters):
+        filter_labels = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing_filters)
         return (
-            f"The verdicts of {filters} against source and ground truth differ: innovations hardly "
-            "show this fault. The re-run with the first action removes most of the position error."
+            f"The verdicts of {filter_labels} against source and ground truth differ: innovations "
+            "hardly show this fault. The re-run with the first action removes most of the position "
+            "error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
-        noise = ""
+        noise_text = ""
         if isinstance(horizontal_tuning, AxisTuning) and (
-            sigma := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
+            noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
         ):
-            noise = f" of {format_metres(sigma)} m"
+            noise_text = f" of {format_metres(noise_m)} m"
         return (
-            f"The position noise{noise} is smaller than KF and EKF2 assume. Only ground truth "
+            f"The position noise{noise_text} is smaller than KF and EKF2 assume. Only ground truth "
             "shows the drift of the source."
         )
     if "source_noise_time_correlated" in finding_ids:
@@ -478,16 +511,21 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence
     unexplained_text = (
         HEADING_HIDES_ERROR if "ekf2_heading_error" in finding_ids else UNEXPLAINED_DIFFERENCE
     )
-    is_gated = "source_outliers" in finding_ids and "ekf2" in differing
-    return _gate_sentence(analysis) if is_gated else unexplained_text
+    rejects_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
+    return _gate_sentence(analysis) if rejects_outliers else unexplained_text
 
 
 def _gate_sentence(analysis: Analysis) -> str:
     innovations = analysis.main.ekf2_innovations
     assert not isinstance(innovations, Unavailable)  # without innovations EKF2 has no verdict
-    accepted = innovations[~(innovations["rejected"] > 0.0)]
+    accepted_innovations = innovations[~(innovations["rejected"] > 0.0)]
     ratio = math.sqrt(
-        float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
+        float(
+            (
+                accepted_innovations["innovation_m"] ** 2
+                / accepted_innovations["innovation_variance_m2"]
+            ).mean()
+        )
     )
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
@@ -499,25 +537,33 @@ def _gate_sentence(analysis: Analysis) -> str:
 def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
-    text = f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
+    difference_text = (
+        f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
+    )
     trials = ranked_causes[0].trials
-    filter_names = {
+    corrected_filters = {
         trial.filter
         for trial in trials
-        if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
+        if improvement(trial) in POSITION_IMPROVEMENTS or not can_show_effect(trial)
     }
-    if len(filter_names) == 2:
+    if len(corrected_filters) == 2:
         return (
-            f"{text}. The fault affects KF and EKF2 equally, so their difference does not "
-            "show the fault."
+            f"{difference_text}. The fault affects KF and EKF2 equally, so their difference does "
+            "not show the fault."
         )
-    after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
-    filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
-    difference_after_m = after.get(filter_name)
+    difference_after_by_filter = {
+        trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
+    }
+    filter_name: FilterName = (
+        "ekf2"
+        if corrected_filters == {"ekf2"} or set(difference_after_by_filter) == {"ekf2"}
+        else "kf"
+    )
+    difference_after_m = difference_after_by_filter.get(filter_name)
     if difference_after_m is None:
-        return f"{text}."
+        return f"{difference_text}."
     suffix = "predicted with EKF2" if filter_name == "ekf2" else "with KF"
-    return f"{text}; {format_metres(difference_after_m)} m {suffix} corrected."
+    return f"{difference_text}; {format_metres(difference_after_m)} m {suffix} corrected."
 
 
 def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
@@ -528,7 +574,7 @@ def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, 
     )
 
 
-def _identity(
+def _make_identity(
     log: LogInfo, request: ComparisonRequest, student: tuple[str, str], **texts: Any
 ) -> Identity:
     return Identity(
@@ -544,20 +590,20 @@ def _identity(
     )
 
 
-def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
+def _settings_text(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
-    texts = []
+    setting_texts = []
     for name, label in KF_SETTINGS.items():
-        value, origin = getattr(settings, name), "set by the user"
+        value, value_origin = getattr(settings, name), "set by the user"
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
-            origin = f"from {aid_of(analysis).noise}"
+            value_origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):
-            origin = "default"
-        texts.append(f"{label} {value:g} {SETTING_RANGES[name].unit} ({origin})")
-    return ", ".join(texts)
+            value_origin = "default"
+        setting_texts.append(f"{label} {value:g} {SETTING_RANGES[name].unit} ({value_origin})")
+    return ", ".join(setting_texts)
 
 
-def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
+def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
@@ -566,7 +612,7 @@ def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
     )
 
 
-def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
+def _changed_parameter_texts(analysis: Analysis) -> tuple[str, ...]:
     if analysis.source.origin.aid is None:
         return ()
     aid, log = analysis.source.origin.aid, analysis.flight.log

@@ -34,14 +34,14 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Changes that shift KF and EKF2 together with the position source: only ground truth shows their
-# effect
-UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of the names of parameters that PX4 reads only at boot (reboot_required in its metadata)
-REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum rejected fraction that the table of re-runs shows
-MIN_SHOWN_REJECTION = 0.005
-TARGETS: Mapping[str, Target] = {
+# Kinds of changes that move KF and EKF2 together with the position source, so that only ground
+# truth shows the effect
+TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
+# Endings of the names of PX4 parameters that are read only at boot (reboot_required)
+REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
+# Minimum fraction of rejected positions that the table of re-runs shows
+MIN_SHOWN_REJECTED_FRACTION = 0.005
+TARGETS_BY_GROUP: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -50,7 +50,7 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Exceptions to TARGETS, by id of the finding
+# Devices to be changed that differ from TARGETS_BY_GROUP, by id of the finding
 TARGETS_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
@@ -86,29 +86,31 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         ):
             continue
         ranked_causes.append(
-            RankedCause(finding, _cause_rank(finding, trials), sum(map(reduction, trials)), trials)
+            RankedCause(finding, _cause_tier(finding, trials), sum(map(reduction, trials)), trials)
         )
-    faults = [cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"]
+    fault_causes = [
+        cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"
+    ]
     return sorted(
-        faults or ranked_causes,
+        fault_causes or ranked_causes,
         key=lambda cause: (
             cause.tier,
             # a changed setting may only hide a fault of the position source
-            cause.tier in (1, 2, 3) and _is_setting(cause.finding),
+            cause.tier in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.reduction,
         ),
     )
 
 
-def _is_setting(finding: Finding) -> bool:
+def _is_setting_fault(finding: Finding) -> bool:
     kinds = CATALOGUE[finding.id].reruns
     return bool(kinds) and kinds <= SETTING_CHANGE_KINDS
 
 
-def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
+def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
     if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION in finding.evidence:
         return 0
-    if _is_setting(finding) and any(map(remains_overconfident, trials)):
+    if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
         return 3
     if any(becomes_consistent(trial) for trial in trials):
         return 1
@@ -132,7 +134,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 def can_show_effect(trial: Trial) -> bool:
     """Return True if innovations or ground truth show the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
-    return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
+    return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def is_useful(trial: Trial) -> bool:
@@ -142,18 +144,20 @@ def is_useful(trial: Trial) -> bool:
 def make_cause(
     analysis: Analysis,
     ranked_cause: RankedCause,
-    verdicts: Sequence[Verdict],
+    sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
     """Describe a fault on the card, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
-    alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
+    alternatives, actions = _make_actions(
+        analysis, ranked_cause, useful_trials, sigma_verdicts, request
+    )
     return structs.replace(
         make_plain_cause(finding),
         alternatives=alternatives,
         actions=actions,
-        reruns=tuple(_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
+        reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
         after=_closing_sentence(analysis, useful_trials, alternatives),
     )
 
@@ -174,79 +178,97 @@ def _make_actions(
     analysis: Analysis,
     ranked_cause: RankedCause,
     useful_trials: Sequence[Trial],
-    verdicts: Sequence[Verdict],
+    sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return (groups of alternative actions, actions that are always necessary)."""
     finding = ranked_cause.finding
-    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
+    trial_by_filter_and_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
     general_action = None
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         general_action = Action(_target_of(finding, analysis.source), remedy)
-    delay = by_kind.get(("ekf2", "delay"))
-    if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
-        shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
-            offset.filter == "kf"
+    delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
+    if offset_trial := trial_by_filter_and_kind.get(
+        ("ekf2", "time offset")
+    ) or trial_by_filter_and_kind.get(("kf", "time offset")):
+        shift_s = offset_trial.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
+            offset_trial.filter == "kf"
         )
-        add_or_subtract = lower_first(format_shift(shift))
-        sender = Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
+        add_or_subtract = lower_first(format_shift(shift_s))
+        timestamp_action = Action(
+            "sender", f"{add_or_subtract} the timestamp (usec) of each position"
+        )
         if analysis.source.origin.is_gnss and general_action is not None:
-            sender = general_action  # users cannot shift the timestamps of a GNSS receiver
-        if delay is not None:
-            alternatives = ((sender,), (set_parameters(analysis, delay.change),))
+            timestamp_action = (
+                general_action  # users cannot shift the timestamps of a GNSS receiver
+            )
+        if delay_trial is not None:
+            alternatives = (
+                (timestamp_action,),
+                (make_parameter_action(analysis, delay_trial.change),),
+            )
         else:
-            actions.append(sender)
-    elif delay is not None:
-        actions.append(set_parameters(analysis, delay.change))
-    elif general_action is not None and not (_is_setting(finding) and ranked_cause.trials):
+            actions.append(timestamp_action)
+    elif delay_trial is not None:
+        actions.append(make_parameter_action(analysis, delay_trial.change))
+    elif general_action is not None and not (_is_setting_fault(finding) and ranked_cause.trials):
         actions.append(general_action)
-    for (filter_name, kind), trial in by_kind.items():
+    for (filter_name, kind), trial in trial_by_filter_and_kind.items():
         if (
             filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            is_default = ("kf", "defaults") in by_kind and kind == "noises"
-            defaults = by_kind["kf", "defaults"].change if is_default else {}
-            actions.append(run_again(request, trial.change, defaults))
+            has_consistent_defaults = (
+                "kf",
+                "defaults",
+            ) in trial_by_filter_and_kind and kind == "noises"
+            default_settings = (
+                trial_by_filter_and_kind["kf", "defaults"].change if has_consistent_defaults else {}
+            )
+            actions.append(make_rerun_action(request, trial.change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
-            parameters = {n: value for n, value in trial.change.items() if n in PARAMETERS}
-            actions += [set_parameters(analysis, parameters)] if parameters else []
+            parameters = {name: value for name, value in trial.change.items() if name in PARAMETERS}
+            actions += [make_parameter_action(analysis, parameters)] if parameters else []
     # KF actions are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reasons = {
+    reason_by_filter = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
-        if name not in targets and (reason := _no_change_reason(finding, filter_name, verdicts))
+        if name not in targets
+        and (reason := _no_change_reason(finding, filter_name, sigma_verdicts))
     }
-    if len(reasons) == 2 and len(set(reasons.values())) == 1:
-        reasons = {"KF, EKF2": reasons["KF"]}
-    actions += [Action(target, reason) for target, reason in reasons.items()]
+    if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
+        reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
+    actions += [Action(target, reason) for target, reason in reason_by_filter.items()]
     return alternatives, tuple(actions)
 
 
 def _no_change_reason(
-    finding: Finding, filter_name: FilterName, verdicts: Sequence[Verdict]
+    finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    words = {
+    word_by_reference = {
         verdict.against: verdict.word
-        for verdict in verdicts
+        for verdict in sigma_verdicts
         if verdict.filter == filter_name and verdict.ratio is not None
     }
-    if not words:
+    if not word_by_reference:
         return ""
-    if set(words.values()) == {"consistent"}:
-        if "truth" not in words and CATALOGUE[finding.id].reruns & UNSEEN_CHANGE_KINDS:
-            return "no change: the log has no ground truth, which would show this fault"
+    if set(word_by_reference.values()) == {"consistent"}:
+        if (
+            "truth" not in word_by_reference
+            and CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        ):
+            return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
             return "no option of KF rejects outliers; do not increase SIGMA_Z (--sigma-z) instead"
-        if words.get("truth", "consistent") == "consistent":
+        if word_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
     return (
         f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
@@ -254,72 +276,83 @@ def _no_change_reason(
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGETS_BY_ID.get(finding.id) or TARGETS[CATALOGUE[finding.id].group]
+    target = TARGETS_BY_ID.get(finding.id) or TARGETS_BY_GROUP[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 
 
-def run_again(
-    request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
+def make_rerun_action(
+    request: ComparisonRequest, change: Mapping[str, float], default_settings: Mapping[str, float]
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``defaults`` are default settings that make KF consistent, too.
+    ``default_settings`` are default settings that make KF consistent, too.
     """
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
-        f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
+        f"{COMPARISON_OPTIONS[name]} (default {default_settings[name]:g})"
+        for name in default_settings
     )
     sentence = f"run again without {options}, or with the estimated noises" if options else ""
     return Action("KF", sentence, (command,), "shell")
 
 
-def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
+def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Action:
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
-    texts, commands = [], []
+    change_texts, commands = [], []
     for name, value in change.items():
         change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
-        texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
+        change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
         commands.append(f"param set {name} {value:g}")
-    commands += ["reboot"] * any(name.endswith(REBOOT_SUFFIXES) for name in change)
-    return Action("EKF2", ", ".join(texts), tuple(commands), "console")
+    commands += ["reboot"] * any(name.endswith(REBOOT_PARAMETER_SUFFIXES) for name in change)
+    return Action("EKF2", ", ".join(change_texts), tuple(commands), "console")
 
 
-def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    before, after = trial.before, trial.after
-    ratios_before, ratios_after = ratios(before), ratios(after)
-    before_after: dict[str, Any] = {
-        "position_rmse_m": (before.position_rmse_m, after.position_rmse_m),
+def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
+    outcome_before, outcome_after = trial.before, trial.after
+    ratios_before, ratios_after = ratios(outcome_before), ratios(outcome_after)
+    before_and_after_by_field: dict[str, Any] = {
+        "position_rmse_m": (outcome_before.position_rmse_m, outcome_after.position_rmse_m),
         "source_ratio": (ratios_before.get("source"), ratios_after.get("source")),
         "truth_ratio": (ratios_before.get("truth"), ratios_after.get("truth")),
     }
-    rejected_fractions = before.rejected_fraction or 0.0, after.rejected_fraction or 0.0
-    if max(rejected_fractions) >= MIN_SHOWN_REJECTION:
-        before_after["rejected_fraction"] = before.rejected_fraction, after.rejected_fraction
+    rejected_fractions = (
+        outcome_before.rejected_fraction or 0.0,
+        outcome_after.rejected_fraction or 0.0,
+    )
+    if max(rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
+        before_and_after_by_field["rejected_fraction"] = (
+            outcome_before.rejected_fraction,
+            outcome_after.rejected_fraction,
+        )
     return Rerun(
         label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=improvement(trial),
-        **{name: pair for name, pair in before_after.items() if None not in pair},
+        **{
+            name: before_and_after
+            for name, before_and_after in before_and_after_by_field.items()
+            if None not in before_and_after
+        },
     )
 
 
 def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind = trial.kinds[0]
     if OUTLIERS in trial.change:
-        name = "KF" if trial.filter == "kf" else "EKF2 (replay)"
-        return f"{name} without the {trial.change[OUTLIERS]:.0f}"
+        filter_label = "KF" if trial.filter == "kf" else "EKF2 (replay)"
+        return f"{filter_label} without the {trial.change[OUTLIERS]:.0f}"
     if trial.filter == "kf":
         options = " ".join(
-            f"{COMPARISON_OPTIONS[name]} {value:g}"
-            for name, value in trial.change.items()
-            if name in (SIGMA_A, SIGMA_Z)
+            f"{COMPARISON_OPTIONS[filter_label]} {value:g}"
+            for filter_label, value in trial.change.items()
+            if filter_label in (SIGMA_A, SIGMA_Z)
         )
         prefix = "default " if kind == "defaults" else ""
         return f"KF, {prefix}{options}" if options else "KF"
-    if sum(each.filter == "ekf2" for each in trials) < 2:
+    if sum(other_trial.filter == "ekf2" for other_trial in trials) < 2:
         return "EKF2 (replay)"
     return f"EKF2 (replay), {'sender' if kind == 'time offset' else 'parameters'}"
 
@@ -339,12 +372,12 @@ def _closing_sentence(
     for trial in useful_trials:
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
             continue
-        default = analysis.flight.log.default_of(next(iter(trial.change)))
+        default_noise_m = analysis.flight.log.default_of(next(iter(trial.change)))
         sigma_z = horizontal_tuning.sigma_z
-        if (sigma_z.low or 0.0) <= default <= (sigma_z.high or 0.0):
+        if (sigma_z.low or 0.0) <= default_noise_m <= (sigma_z.high or 0.0):
             return (
-                f"PX4's default of {default:g} m is inside the 95 % interval of the estimate, so "
-                "it is equally good."
+                f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
+                "estimate, so it is equally good."
             )
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean

@@ -17,11 +17,11 @@ Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF
 FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 # Limits of the logarithmic axis of σ ratios
-AXIS_ENDS = (0.1, 10.0)
-AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Maximum number of causes on a card
+RATIO_AXIS_ENDS = (0.1, 10.0)
+RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
+# Maximum number of causes on a diagnosis card
 MAX_CAUSES = 3
-# Maximum number of notes on the cover and the terminal
+# Maximum number of notes on a diagnosis card
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
@@ -32,8 +32,8 @@ def axis_fraction(ratio: float) -> float:
     >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
     (0.0, 0.5, 1.0)
     """
-    low, high = (math.log10(end) for end in AXIS_ENDS)
-    return (math.log10(ratio) - low) / (high - low)
+    log_low, log_high = (math.log10(end) for end in RATIO_AXIS_ENDS)
+    return (math.log10(ratio) - log_low) / (log_high - log_low)
 
 
 class Verdict(Record, frozen=True, kw_only=True):
@@ -167,7 +167,7 @@ class Note(Record, frozen=True):
 
 
 class Identity(Record, frozen=True, kw_only=True):
-    """Flight, software versions and settings that a card describes.
+    """Flight, software versions and settings of a diagnosis card.
 
     Attributes
     ----------
@@ -222,7 +222,7 @@ class Card(Record, frozen=True, kw_only=True):
     difference : str
         Position difference KF - EKF2 before and after the first fix.
     more_causes : int
-        Number of causes that the card does not list.
+        Number of causes beyond :data:`MAX_CAUSES`, which ``causes`` does not contain.
     facts : mapping from label to str
         Other texts, for example the fix for a log that cannot be read.
     """

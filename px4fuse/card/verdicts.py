@@ -20,46 +20,49 @@ BOOTSTRAP_RESAMPLES = 2000
 MIN_BOOTSTRAP_BLOCKS = 4
 
 
-def verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
+def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     """Return the verdicts along one axis: KF and EKF2, each against source and ground truth."""
     return tuple(
         verdict
         for filter_name in ("kf", "ekf2")
-        for verdict in (_against_source(result, filter_name), _against_truth(result, filter_name))
+        for verdict in (
+            _verdict_against_source(result, filter_name),
+            _verdict_against_truth(result, filter_name),
+        )
     )
 
 
-def _against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
-    statement = result.filters[filter_name]
-    if not isinstance(statement, FilterSummary):
-        return _not_evaluated(filter_name, "source", statement)
+def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    summary = result.filters[filter_name]
+    if not isinstance(summary, FilterSummary):
+        return _not_evaluated(filter_name, "source", summary)
     return Verdict(
         filter=filter_name,
         against="source",
-        ratio=statement.sigma_ratio,
-        interval=sigma_ratio_interval(statement.nis_mean, statement.nis_band),
-        word=statement.verdict,
-        samples=statement.count,
+        ratio=summary.sigma_ratio,
+        interval=sigma_ratio_interval(summary.nis_mean, summary.nis_band),
+        word=summary.verdict,
+        samples=summary.count,
     )
 
 
-def _against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
+def _verdict_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
     truth = result.filters[filter_name].truth
     if isinstance(truth, Unavailable):
         return _not_evaluated(filter_name, "truth", truth)
     errors = normalised_position_errors(result, filter_name)
     if isinstance(errors, Unavailable):
         return _not_evaluated(filter_name, "truth", errors)
-    time_s, normalised = errors
-    ratio = float(np.sqrt(np.mean(np.square(normalised))))
-    interval = block_bootstrap_rms(time_s, normalised)
+    time_s, normalised_errors = errors
+    ratio = float(np.sqrt(np.mean(np.square(normalised_errors))))
+    interval = block_bootstrap_rms(time_s, normalised_errors)
     return Verdict(
         filter=filter_name,
         against="truth",
         ratio=ratio,
         interval=interval,
         word=classify_sigma_ratio(ratio, "truth", interval),
-        samples=len(normalised),
+        samples=len(normalised_errors),
     )
 
 
@@ -81,11 +84,13 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
         return None
     starts = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
     ends = np.searchsorted(time_s, time_s[starts] + BOOTSTRAP_BLOCK_S)
-    sums = np.concatenate(([0.0], np.cumsum(np.square(values))))
+    cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
     drawn_starts = np.random.default_rng(0).integers(
         len(starts), size=(BOOTSTRAP_RESAMPLES, block_count)
     )
-    square_sum = (sums[ends] - sums[starts])[drawn_starts].sum(axis=1)
-    count = (ends - starts)[drawn_starts].sum(axis=1)
-    low, high = np.percentile(np.sqrt(square_sum / count), (2.5, 97.5))
+    drawn_square_sums = (cumulative_squares[ends] - cumulative_squares[starts])[drawn_starts].sum(
+        axis=1
+    )
+    drawn_counts = (ends - starts)[drawn_starts].sum(axis=1)
+    low, high = np.percentile(np.sqrt(drawn_square_sums / drawn_counts), (2.5, 97.5))
     return float(low), float(high)

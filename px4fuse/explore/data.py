@@ -9,8 +9,8 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
-from px4fuse.card.model import AXIS_ENDS
-from px4fuse.card.verdicts import verdicts
+from px4fuse.card.model import RATIO_AXIS_ENDS
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
@@ -29,13 +29,13 @@ from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, command_line
 
-# Data of the page, which become JSON
-Data = dict[str, Any]
-# Range of the time offset slider (s) below and above the analysed time offset
-OFFSET_HALF_RANGE_S = 0.6
+# Data of the explore page, encoded as JSON
+PageData = dict[str, Any]
+# Half the range (s) of the time offset slider, centred at the analysed time offset
+OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
-def flight_data(analysis: Analysis, packer: Packer) -> Data:
+def flight_data(analysis: Analysis, packer: Packer) -> PageData:
     """Return the data of one flight, which become JSON; the arrays are added to the packer."""
     signals = replay_signals(analysis, packer)
     events, request = analysis.events, analysis.request
@@ -63,7 +63,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
     }
 
 
-def replay_signals(comparison: Comparison, packer: Packer) -> Data:
+def replay_signals(comparison: Comparison, packer: Packer) -> PageData:
     """Return the inputs of KF."""
     source = raw_source(comparison)
     return {
@@ -74,7 +74,7 @@ def replay_signals(comparison: Comparison, packer: Packer) -> Data:
     }
 
 
-def ranges() -> Data:
+def ranges() -> PageData:
     """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
     return {
         "sigma-a": SETTING_RANGES["sigma_a_m_s2"][:2],
@@ -82,7 +82,7 @@ def ranges() -> Data:
         "dt": SETTING_RANGES["dt_s"][:2],
         "lesson": _settings_data(Settings()),
         "bands": CONSISTENT_RATIOS,
-        "ends": list(AXIS_ENDS),
+        "ends": list(RATIO_AXIS_ENDS),
         "marks": MARK_PATHS,
     }
 
@@ -92,7 +92,7 @@ def raw_source(comparison: Comparison) -> PositionTrack:
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
-def _settings_data(settings: Settings) -> Data:
+def _settings_data(settings: Settings) -> PageData:
     return {
         "sigmaA": settings.sigma_a_m_s2,
         "sigmaZ": settings.sigma_z_m,
@@ -102,80 +102,78 @@ def _settings_data(settings: Settings) -> Data:
     }
 
 
-def _offset_data(request: ComparisonRequest, analysis: Analysis) -> Data:
+def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return range and estimate of the time offset, or the reason why the slider is disabled."""
     if request.position is not None:
         return {"why": "the time offset aligns the position file with the log"}
-    centre, clock = analysis.settings.clock_offset_s, analysis.clock
+    analysed_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
     estimate_s = None
     if isinstance(clock, ClockOffset) and clock.is_determinable:
-        estimate_s = centre + clock.remaining_s
+        estimate_s = analysed_offset_s + clock.remaining_s
     return {
-        "from": centre - OFFSET_HALF_RANGE_S,
-        "to": centre + OFFSET_HALF_RANGE_S,
+        "from": analysed_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
+        "to": analysed_offset_s + OFFSET_SLIDER_HALF_RANGE_S,
         "likely": estimate_s,
     }
 
 
-def _imu_data(comparison: Comparison, packer: Packer) -> Data | str:
+def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     """Return times, gaps and span of the acceleration, or the reason why it is missing."""
     acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
-    time = acceleration.time_s
-    gap_starts = np.flatnonzero(imu_gaps(time))
-    gap_edges = np.stack([time[gap_starts], time[gap_starts + 1]], 1)
-    cumulative_gap_s = np.cumsum(gap_edges[:, 1] - gap_edges[:, 0])
+    time_s = acceleration.time_s
+    gap_starts = np.flatnonzero(imu_gaps(time_s))
+    gap_edges_s = np.stack([time_s[gap_starts], time_s[gap_starts + 1]], 1)
+    cumulative_gap_s = np.cumsum(gap_edges_s[:, 1] - gap_edges_s[:, 0])
     return {
-        "time": packer.add_times(time[_used_samples(comparison, acceleration)]),
-        "span": [time[0], time[-1]],
-        "gapEdges": gap_edges.ravel().tolist(),
+        "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
+        "span": [time_s[0], time_s[-1]],
+        "gapEdges": gap_edges_s.ravel().tolist(),
         "gapSum": np.stack([np.concatenate([[0.0], cumulative_gap_s])[:-1], cumulative_gap_s], 1)
         .ravel()
         .tolist(),
     }
 
 
-def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
+def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
     """Return the IMU samples of the segment as a slice, with one more sample at each end."""
-    segment, time = comparison.segment, acceleration.time_s
-    low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
-    high = int(np.searchsorted(time, segment.end_s)) + 1
-    return slice(max(low, 0), high)
+    segment, time_s = comparison.segment, acceleration.time_s
+    first_row = int(np.searchsorted(time_s, segment.start_s, side="right")) - 1
+    end_row = int(np.searchsorted(time_s, segment.end_s)) + 1
+    return slice(max(first_row, 0), end_row)
 
 
 def _axis_signals(
     comparison: Comparison, axis: Axis, raw_source: PositionTrack, packer: Packer
-) -> Data:
+) -> PageData:
     """Return measurements of an axis, in and near the segment, and its integrated acceleration."""
     segment = comparison.segment
-    time = raw_source.samples.index.to_numpy()
-    value = weighted_sum(raw_source.samples, Columns.POSITION, axis.direction)
-    half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
-    is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
-    is_in_reach &= np.isfinite(value)
-    signals: Data = {
+    time_s = raw_source.samples.index.to_numpy()
+    position_m = weighted_sum(raw_source.samples, Columns.POSITION, axis.direction)
+    reach_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
+    is_in_reach = (time_s >= segment.start_s - reach_s) & (time_s <= segment.end_s + reach_s)
+    is_in_reach &= np.isfinite(position_m)
+    signals: PageData = {
         "name": axis.name,
-        "time": packer.add_times(time[is_in_reach]),
-        "z": packer.add(value[is_in_reach]),
+        "time": packer.add_times(time_s[is_in_reach]),
+        "z": packer.add(position_m[is_in_reach]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        velocity_integral = axis.acceleration.integral_m_s[
-            _used_samples(comparison, axis.acceleration)
-        ]
+        velocity_m_s = axis.acceleration.integral_m_s[_segment_slice(comparison, axis.acceleration)]
         signals |= {
-            "integral": packer.add(velocity_integral - velocity_integral[0]),
+            "integral": packer.add(velocity_m_s - velocity_m_s[0]),
             "rms": axis.acceleration.rms_m_s2,
         }
     return signals
 
 
-def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data:
+def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData:
     name = result.axis.name
     return {
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
-        "ratios": [verdict.ratio for verdict in verdicts(result)],
+        "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their noise estimates if they exist
@@ -185,46 +183,49 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
     }
 
 
-def _nis_bands(count: int, packer: Packer) -> list[dict[str, int]]:
+def _nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
     """Return the 95 % band of the mean NIS for each possible number of innovations.
 
     The number changes because the time offset moves measurements into or out of the segment.
     """
-    counts = np.arange(1, 2 * count + 1)
+    innovation_counts = np.arange(1, 2 * innovation_count + 1)
     probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
     return [
-        packer.add(np.asarray(stats.chi2.ppf(probability, counts)) / counts, COARSE_SCALE)
+        packer.add(
+            np.asarray(stats.chi2.ppf(probability, innovation_counts)) / innovation_counts,
+            COARSE_SCALE,
+        )
         for probability in probabilities
     ]
 
 
-def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data | str:
+def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
-    consistency = result.filters["ekf2"]
-    ekf2: Data = {
+    summary = result.filters["ekf2"]
+    ekf2_data: PageData = {
         "state": _pack_frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": [],
         "innovations": [],
-        "summary": {"why": consistency.reason}
-        if isinstance(consistency, Unavailable)
+        "summary": {"why": summary.reason}
+        if isinstance(summary, Unavailable)
         else {
             "why": "",
-            "count": consistency.count,
-            "outside": consistency.fraction_outside_two_sigma,
-            "lag1": consistency.lag1_autocorrelation,
+            "count": summary.count,
+            "outside": summary.fraction_outside_two_sigma,
+            "lag1": summary.lag1_autocorrelation,
         },
         "r": None,
     }
-    if isinstance(consistency.truth, ErrorsAgainstTruth):
-        ekf2["summary"] |= {
-            "truthP": consistency.truth.position_rmse_m,
-            "truthV": consistency.truth.velocity_rmse_m_s,
+    if isinstance(summary.truth, ErrorsAgainstTruth):
+        ekf2_data["summary"] |= {
+            "truthP": summary.truth.position_rmse_m,
+            "truthV": summary.truth.velocity_rmse_m_s,
         }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
-        ekf2["variance"] = _pack_frame(
+        ekf2_data["variance"] = _pack_frame(
             sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
         )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
@@ -236,17 +237,17 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
             rejected=(valid_rows["rejected"] > 0).astype(float),
             sigma=np.sqrt(valid_rows["innovation_variance_m2"]),
         )
-        ekf2["innovations"] = _pack_frame(
+        ekf2_data["innovations"] = _pack_frame(
             packed_rows, ["innovation_m", "sigma", "rejected"], packer
         )
         variance_m2 = innovations["observation_variance_m2"].dropna()
-        ekf2["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
+        ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
     else:
-        ekf2["why"] = result.ekf2_innovations.reason
-    return ekf2
+        ekf2_data["why"] = result.ekf2_innovations.reason
+    return ekf2_data
 
 
-def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
+def _truth_data(result: AxisComparison, packer: Packer) -> PageData | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
     position = result.truth[["position_m"]].dropna()
@@ -262,7 +263,7 @@ def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
-def _likely_noises(analysis: Analysis) -> Data:
+def _likely_noises(analysis: Analysis) -> PageData:
     """Return the maximum-likelihood estimates of SIGMA_A and SIGMA_Z by axis."""
     return {
         name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
@@ -281,26 +282,30 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
     }
 
 
-def _command_data(request: ComparisonRequest, comparison: Comparison) -> Data:
+def _command_data(request: ComparisonRequest, comparison: Comparison) -> PageData:
     """Return the `compare` command, with automatic and with explicit segment and aisle.
 
     Automatic segment and aisle depend on the clock offset, so a command with another offset states
     them explicitly.
     """
     offset_s = None if request.position is None else request.clock_offset_s
-    base_request = msgspec.structs.replace(
+    automatic_request = msgspec.structs.replace(
         request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
-    heading = next((line.heading_deg for line in comparison.lines if line.name == AISLE), None)
-    fixed_request = msgspec.structs.replace(
-        base_request,
+    aisle_heading_deg = next(
+        (line.heading_deg for line in comparison.lines if line.name == AISLE), None
+    )
+    explicit_request = msgspec.structs.replace(
+        automatic_request,
         start_s=comparison.segment.start_s,
         end_s=comparison.segment.end_s,
-        heading_deg=heading if base_request.heading_deg is None else base_request.heading_deg,
+        heading_deg=aisle_heading_deg
+        if automatic_request.heading_deg is None
+        else automatic_request.heading_deg,
     )
     return {
-        "base": command_line(base_request, for_shell=True),
-        "fixed": command_line(fixed_request, for_shell=True),
+        "base": command_line(automatic_request, for_shell=True),
+        "fixed": command_line(explicit_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(comparison.lines[0].acceleration, Unavailable)

@@ -14,23 +14,42 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.core.record import Record, read_toml
-from px4fuse.explore.data import Data
+from px4fuse.explore.data import PageData
 
-# Options of a drawing function of Bokeh
-Style = dict[str, Any]
-# Columns of all Bokeh data sources, for example time, position, velocity and their σ; JavaScript
-# fills those that a plot needs
-COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
+# Keyword arguments of Bokeh's drawing functions
+BokehStyle = dict[str, Any]
+# Columns of the Bokeh data sources, filled by JavaScript: time, position, velocity and σ of both;
+# KF gains; position error and its ±2σ limits; plotted values x, y, z; arrow angle; event row, start
+# and end
+SOURCE_COLUMNS = (
+    "t",
+    "p",
+    "v",
+    "sp",
+    "sv",
+    "k0",
+    "k1",
+    "e",
+    "minus",
+    "plus",
+    "x",
+    "y",
+    "z",
+    "turn",
+    "row",
+    "left",
+    "right",
+)
 # JavaScript sets the colours by `name`. KF is solid and round, EKF2 dashed and square
-KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
-EKF2_LINE: Style = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
-TRUTH_LINE: Style = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
-HOLLOW_MARKER: Style = {"fill_color": None, "line_color": "black"}
-# Arrow head at the upper or lower edge, for a value outside the plot
-ARROW_MARKER: Style = {"angle": "turn", "marker": "triangle"}
+KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
+EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
+TRUTH_LINE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
+HOLLOW_MARKER: BokehStyle = {"fill_color": None, "line_color": "black"}
+# Arrow head at the upper or lower edge of a plot, for a value outside the plot
+ARROW_MARKER: BokehStyle = {"angle": "turn", "marker": "triangle"}
 # Band around the values of a consistent filter
-CONSISTENT_BAND: Style = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
-GAP_BAND: Style = {
+CONSISTENT_BAND: BokehStyle = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
+GAP_BAND: BokehStyle = {
     "level": "underlay",
     "fill_color": None,
     "line_color": None,
@@ -38,15 +57,15 @@ GAP_BAND: Style = {
     "hatch_color": "#888888",
     "hatch_alpha": 0.6,
 }
-# Limit of innovation ÷ √S that contains 95 % of the values of a consistent filter
-NORMAL_LIMIT = 2.0
-# Limit (±) of the axis of innovation ÷ √S
-NORMAL_END = 4.6
+# Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
+CONSISTENT_LIMIT = 2.0
+# Limit (±) of the plot axis of innovation ÷ √S
+INNOVATION_AXIS_LIMIT = 4.6
 # Left margin (pixels) of a plot
-LEFT_BORDER = 50
-# Left margin (pixels) of the event plot, whose labels are longer, and of the plot above it
-EVENT_BORDER = 82
-STYLES = {
+LEFT_MARGIN_PIXELS = 50
+# Left margin (pixels) of the event plot and of the position plot above it: event labels are long
+EVENT_LEFT_MARGIN_PIXELS = 82
+LINE_STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
     "ekf2": EKF2_LINE,
@@ -86,10 +105,10 @@ class Figures(Record, frozen=True):
 FIGURES = read_toml(__file__, "figures.toml", Figures)
 
 
-def document_json(data: Data) -> tuple[Any, dict[str, str]]:
+def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
     """Return Bokeh's document with all plots, and the name of each plot by its id."""
     document = Document()
-    time_range = _page_range("time")
+    time_range = _axis_range("time")
     plots = _make_plots(data, time_range)
     plots |= {
         "strip": _event_plot(data, time_range),
@@ -101,23 +120,23 @@ def document_json(data: Data) -> tuple[Any, dict[str, str]]:
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
-def has_reference(data: Data) -> bool:
+def has_reference(data: PageData) -> bool:
     """Return True if KF can be compared with ground truth or EKF2 along some axis."""
-    return _has_kind(data, "truth") or _has_kind(data, "ekf2")
+    return _has_track(data, "truth") or _has_track(data, "ekf2")
 
 
-def _has_kind(data: Data, kind: str) -> bool:
+def _has_track(data: PageData, kind: str) -> bool:
     return any(isinstance(axis[kind], dict) for axis in data["axes"])
 
 
-def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
-    missing_kinds = {kind for kind in ("ekf2", "truth") if not _has_kind(data, kind)}
+def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
+    missing_tracks = {kind for kind in ("ekf2", "truth") if not _has_track(data, kind)}
     plots: dict[str, Any] = {}
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        sources = _Sources(name)
-        fig = plots[name] = _figure(
+        data_sources = _PlotSources(name)
+        plot_figure = plots[name] = _figure(
             name,
             215,
             x_range=time_range,
@@ -125,33 +144,37 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
             lod_threshold=None,
-            min_border_left=EVENT_BORDER if name == "position" else LEFT_BORDER,
+            min_border_left=EVENT_LEFT_MARGIN_PIXELS if name == "position" else LEFT_MARGIN_PIXELS,
         )
         if name == "position":
-            _draw_dots(fig, sources["measured"], "t z", 3, name="measured")
+            _draw_dots(plot_figure, data_sources["measured"], "t z", 3, name="measured")
         if name == "innovation":
-            _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
+            _draw_innovations(plot_figure, data_sources, with_ekf2="ekf2" not in missing_tracks)
         if name == "error":
-            fig.varea(
-                "t", "minus", "plus", source=sources["error"], fill_alpha=0.25, name="kf_band"
+            plot_figure.varea(
+                "t", "minus", "plus", source=data_sources["error"], fill_alpha=0.25, name="kf_band"
             )
-        lines: list[Any] = []
-        for source, column, style_name, hover_name in plot.lines:
-            if style_name in missing_kinds:
+        line_renderers: list[Any] = []
+        for source_name, column, style_name, hover_name in plot.lines:
+            if style_name in missing_tracks:
                 continue
-            line_renderer = fig.line("t", column, source=sources[source], **STYLES[style_name])
-            lines.append(line_renderer)
+            line_renderer = plot_figure.line(
+                "t", column, source=data_sources[source_name], **LINE_STYLES[style_name]
+            )
+            line_renderers.append(line_renderer)
             if hover_name:
-                _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
+                _add_hover(
+                    plot_figure, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}")
+                )
         if name == "error":  # the initial 2σ band is too wide for scaling the axis
-            fig.y_range.renderers = lines
-        _add_cursor(fig, name="cursor")
+            plot_figure.y_range.renderers = line_renderers
+        _add_cursor(plot_figure, name="cursor")
         for low, high in data["events"]["gap"]:
-            fig.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
+            plot_figure.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
     return plots
 
 
-class _Sources(dict[str, ColumnDataSource]):
+class _PlotSources(dict[str, ColumnDataSource]):
     """Bokeh data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:
@@ -162,26 +185,34 @@ class _Sources(dict[str, ColumnDataSource]):
         return self[name]
 
 
-def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
-    fig.y_range = Range1d(start=-NORMAL_END, end=NORMAL_END)
-    fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
-    kf_dots = _draw_dots(fig, sources["updates"], "t x", 4, name="kf")
-    _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
-    _draw_dots(fig, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
+def _draw_innovations(
+    plot_figure: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool
+) -> None:
+    plot_figure.y_range = Range1d(start=-INNOVATION_AXIS_LIMIT, end=INNOVATION_AXIS_LIMIT)
+    plot_figure.add_layout(
+        BoxAnnotation(bottom=-CONSISTENT_LIMIT, top=CONSISTENT_LIMIT, **CONSISTENT_BAND)
+    )
+    kf_dots = _draw_dots(plot_figure, sources["updates"], "t x", 4, name="kf")
+    _add_hover(plot_figure, kf_dots, ("KF", "@x{0.00}"))
+    _draw_dots(plot_figure, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
-        style: Style = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(fig, sources["fused"], "t x", 4, **style)
-        rejected_dots = _draw_dots(fig, sources["rejected"], "t x", 7, **style, **HOLLOW_MARKER)
-        _add_hover(fig, fused_dots, ("EKF2", "@x{0.00}"))
-        _add_hover(fig, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
-        _draw_dots(fig, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
+        style: BokehStyle = {"marker": "square", "name": "ekf2"}
+        fused_dots = _draw_dots(plot_figure, sources["fused"], "t x", 4, **style)
+        rejected_dots = _draw_dots(
+            plot_figure, sources["rejected"], "t x", 7, **style, **HOLLOW_MARKER
+        )
+        _add_hover(plot_figure, fused_dots, ("EKF2", "@x{0.00}"))
+        _add_hover(plot_figure, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
+        _draw_dots(plot_figure, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
 
 
-def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
-    tips = [("time", "@t{0.00} s"), *rows]
+def _add_hover(plot_figure: Any, renderer: Any, *rows: tuple[str, str]) -> None:
+    tooltip_rows = [("time", "@t{0.00} s"), *rows]
     # on different sides, so that tooltips do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
-    fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
+    plot_figure.add_tools(
+        HoverTool(renderers=[renderer], tooltips=tooltip_rows, mode="vline", attachment=side)
+    )
 
 
 def _figure(name: str, height: int, **options: Any) -> Any:
@@ -190,32 +221,32 @@ def _figure(name: str, height: int, **options: Any) -> Any:
     )
 
 
-def _add_cursor(fig: Any, **options: Any) -> None:
+def _add_cursor(plot_figure: Any, **options: Any) -> None:
     """Add a vertical line at the time or position of the selected measurement."""
-    fig.add_layout(Span(dimension="height", location=0.0, visible=False, **options))
+    plot_figure.add_layout(Span(dimension="height", location=0.0, visible=False, **options))
 
 
-def _page_range(name: str | None = None) -> Range1d:
+def _axis_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _empty_source(name: str) -> ColumnDataSource:
-    return ColumnDataSource({column: [] for column in COLUMNS.split()}, name=f"{name}-source")
+    return ColumnDataSource({column: [] for column in SOURCE_COLUMNS}, name=f"{name}-source")
 
 
-def _event_plot(data: Data, time_range: Range1d) -> Any:
+def _event_plot(data: PageData, time_range: Range1d) -> Any:
     source = _empty_source("strip")
-    rows = FIGURES.event_rows if _has_kind(data, "ekf2") else FIGURES.event_rows[2:]
-    fig = _figure(
+    rows = FIGURES.event_rows if _has_track(data, "ekf2") else FIGURES.event_rows[2:]
+    plot_figure = _figure(
         "strip",
         28 * len(rows) + 24,
         x_range=time_range,
         y_range=FactorRange(factors=rows),
         tools="xbox_zoom,xpan",
         active_drag="xbox_zoom",
-        min_border_left=EVENT_BORDER,
+        min_border_left=EVENT_LEFT_MARGIN_PIXELS,
     )
-    fig.hbar(
+    plot_figure.hbar(
         y="row",
         left="left",
         right="right",
@@ -225,30 +256,34 @@ def _event_plot(data: Data, time_range: Range1d) -> Any:
         line_color="#7d8894",
         name="event",
     )
-    _add_cursor(fig, name="cursor")
-    return fig
+    _add_cursor(plot_figure, name="cursor")
+    return plot_figure
 
 
-def _draw_dots(fig: Any, source: ColumnDataSource, columns: str, size: int, **style: Any) -> Any:
-    x, y = columns.split()
-    return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
+def _draw_dots(
+    plot_figure: Any, source: ColumnDataSource, xy_columns: str, size: int, **style: Any
+) -> Any:
+    x, y = xy_columns.split()
+    return plot_figure.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
 def _phase_plot() -> Any:
     """Make the phase plane: KF position and velocity, their 2σ ellipse, and the measurement."""
-    fig = _figure(
+    plot_figure = _figure(
         "step",
         330,
-        x_range=_page_range(),
-        y_range=_page_range(),
+        x_range=_axis_range(),
+        y_range=_axis_range(),
         tools="",
         x_axis_label="position (m)",
         y_axis_label="velocity (m/s)",
     )
-    fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
-    _add_cursor(fig, name="measurement", line_dash=[2, 2])
-    fig.line("p", "v", source=_empty_source("trail-means"), name="measured")
-    fig.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
-    fig.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, _empty_source("mean"), "p v", 7, name="kf")
-    return fig
+    plot_figure.add_layout(
+        BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
+    )
+    _add_cursor(plot_figure, name="measurement", line_dash=[2, 2])
+    plot_figure.line("p", "v", source=_empty_source("trail-means"), name="measured")
+    plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
+    plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
+    _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")
+    return plot_figure

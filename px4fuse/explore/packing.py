@@ -12,12 +12,12 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Rounding steps per m, m/s or s for values that KF uses: 1 % of the tolerance between KF in
-# JavaScript and KF in Python
+# Number of rounding steps per unit (m, m/s or s) of inputs of KF: the rounding error is 1 % of the
+# tolerance between KF in JavaScript and KF in Python
 FINE_SCALE = 2.0**36
-# Rounding steps per m, m/s or s for values that are only drawn or averaged
+# Number of rounding steps per unit (m, m/s or s) of values that are only drawn or averaged
 COARSE_SCALE = 1e6
-# Largest integer that JavaScript represents exactly, with a margin of a factor of two
+# Maximum integer: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
 
 
@@ -37,9 +37,11 @@ class Packer:
         integers = np.rint(values * scale).astype(np.int64)
         differences = np.diff(integers, prepend=0)
         # the lowest bit is the sign, so small negative numbers have few bits too
-        zigzag = ((differences << 1) ^ (differences >> 63)).astype("<u8")
-        plane_count = max(1, (int(zigzag.max(initial=0)).bit_length() + 7) // 8)
-        self._bytes.append(zigzag.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes())
+        signed_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
+        plane_count = max(1, (int(signed_integers.max(initial=0)).bit_length() + 7) // 8)
+        self._bytes.append(
+            signed_integers.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes()
+        )
         self.array_specs.append((len(values), plane_count, scale))
         return {"array": len(self.array_specs) - 1}
 

@@ -6,13 +6,13 @@ from importlib.metadata import version
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import Data, flight_data, ranges
+from px4fuse.explore.data import PageData, flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
-from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
+from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 
-# Maximum length (characters) of a text from a log
+# Maximum length (characters) of a text from a log on the explore page
 MAX_LOG_TEXT_LENGTH = 2000
 SCRIPT_NAMES = ("card", "step", "times")
 PACKAGE = "px4fuse.explore"
@@ -34,7 +34,7 @@ def html_text(analysis: Analysis) -> str:
     )
 
 
-def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
+def data_scripts(data: PageData, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
     """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
     document, places = document_json(data)
     content = {"flight": data, "ranges": ranges(), "packed": packer.array_specs, "places": places}
@@ -51,7 +51,7 @@ def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "
 
 def page_text(
     data_elements: str,
-    data: Data,
+    data: PageData,
     *,
     command: str,
     title: str,
@@ -86,7 +86,7 @@ def page_text(
         + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPT_NAMES, practice, "page")),
     }
     return load_template("explore/page.html").render(
-        {f"{name}_hash": policy_hash(text) for name, text in scripts_by_name.items()},
+        {f"{name}_hash": csp_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
         style="".join(map(read_asset, ("colours.css", "base.css")))
         + card_style()

@@ -28,8 +28,13 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
-# Pairs of answers whose injected faults can occur in one flight without hiding each other
-COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
+# Pairs of quiz answers whose injected faults do not hide each other in one flight
+COMBINABLE_CHOICES = (
+    {"clock", "source"},
+    {"clock", "gate"},
+    {"frame", "source"},
+    {"frame", "gate"},
+)
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
@@ -47,12 +52,12 @@ SCENARIO_VALUES: dict[str, Any] = {
 # Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
 # Id of the finding whose time span is the time span of the injected fault
-FINDING_WITH_TIME = {
+FINDING_WITH_TIME_BY_MISTAKE = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-# Name of the fault "SIGMA_Z of KF is too small", which is a wrong setting and not in the log
+# Name of the injected fault "SIGMA_Z of KF is too small", a wrong setting of KF
 NOISY_UWB = "noisy-uwb"
 
 
@@ -88,8 +93,8 @@ class MistakeTable(Record, frozen=True):
     mistakes: tuple[HiddenMistake, ...]
 
 
-_TABLES = read_toml(__file__, "practice.toml", MistakeTable)
-FAULT_CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
+_QUIZ = read_toml(__file__, "practice.toml", MistakeTable)
+FAULT_CHOICES, HIDDEN_MISTAKES = _QUIZ.choices, _QUIZ.mistakes
 
 
 @dataclass(frozen=True)
@@ -118,10 +123,10 @@ def draw_flights(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFl
         Number of flights.
     """
     rng = np.random.default_rng([seed, level, count])
-    names: list[str] = []
-    while len(names) < count:
-        names += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
-    return tuple(_draw_flight(rng, name, level) for name in names[:count])
+    choices: list[str] = []
+    while len(choices) < count:
+        choices += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
+    return tuple(_draw_flight(rng, name, level) for name in choices[:count])
 
 
 def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
@@ -131,7 +136,7 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
     mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice])
     if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
         pairs = ((mistake, {mistake.choice, choice}) for mistake in HIDDEN_MISTAKES)
-        mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_GROUPS])
+        mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_CHOICES])
     sizes, noise_m = [], SIGMA_Z_M
     for mistake in mistakes:
         sign = "-" if mistake.has_either_sign and rng.random() < 0.5 else ""
@@ -158,14 +163,14 @@ def practice_text(
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    scripts = []
+    data_elements = []
     data: dict[str, Any] = {}
     for number, practice_flight in enumerate(draw_flights(seed, level, count)):
         progress(f"flight {number + 1}", number, count)
-        data, script = _flight_data(practice_flight, number)
-        scripts.append(script)
+        data, data_element = _flight_data(practice_flight, number)
+        data_elements.append(data_element)
     return page_text(
-        "\n".join(scripts),
+        "\n".join(data_elements),
         data,
         command="practice",
         title="simulated flights with known faults",
@@ -189,36 +194,39 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
     descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
-    key = {
+    answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
         "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
     }
-    compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
-    scripts = data_scripts(data, analysis, packer, f"-{number}")
-    return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>'
+    compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
+    data_elements = data_scripts(data, analysis, packer, f"-{number}")
+    return (
+        data,
+        f'{data_elements}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>',
+    )
 
 
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    finding_id = FINDING_WITH_TIME.get(mistake.mistake)
+    finding_id = FINDING_WITH_TIME_BY_MISTAKE.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
-    time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
+    time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
         "fault": mistake.fault,
-        "size": mistake.size_text.format(*size_in_words(size)),
-        "time": time,
+        "size": mistake.size_text.format(*size_parts(size)),
+        "time": time_text,
         "symptom": mistake.symptom,
         "view": mistake.view,
         "span": list(spans[0]) if spans else None,
     }
 
 
-def size_in_words(size: str) -> list[str]:
+def size_parts(size: str) -> list[str]:
     """Split the size of an injected fault at commas, and add a blank before each unit.
 
-    >>> size_in_words("5%,2m"), size_in_words("-400ms"), size_in_words("0.3")
+    >>> size_parts("5%,2m"), size_parts("-400ms"), size_parts("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
     """
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
@@ -227,10 +235,10 @@ def size_in_words(size: str) -> list[str]:
 def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     if card.causes or not descriptions:
         return card
-    fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
+    fault_text = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
     return structs.replace(
         card,
         severity="warning",
-        headline=fault[0].upper() + fault[1:],
+        headline=fault_text[0].upper() + fault_text[1:],
         do_this=("None of the automatic checks finds this fault. Compare the plots.",),
     )

@@ -17,13 +17,13 @@ from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 # External vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which EKF2 may ignore the barometer: ground effect changes the pressure
+# Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
 TAKE_OFF_S = 10.0
 # Minimum ratio of EKF2's largest height error in a barometer gap to its height RMSE outside the gap
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Fraction of the time with a bad vertical acceleration above which the finding is a warning
+# Maximum fraction of the time with a bad vertical acceleration for severity note
 MAX_BAD_FRACTION_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {
@@ -34,7 +34,7 @@ CHECKS = {
     "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
     "EKF2_EV_CTRL": "Check the position source and its data link.",
 }
-OTHER_CHECK = "Check mounting and power supply of the sensor."
+DEFAULT_CHECK = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -44,7 +44,7 @@ def detect(analysis: Analysis) -> Findings:
     aid = analysis.source.origin.aid
     take_off_s = [start_s for start_s, _ in airborne_spans(analysis.flight)]
     barometer = analysis.aids.get(BAROMETER.name)
-    height_error_m = _height_error_in(analysis, barometer.longest_gap_s) if barometer else None
+    height_error_m = _large_height_error_m(analysis, barometer.longest_gap_s) if barometer else None
     yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
     yield from detect_bad_acceleration(analysis, analysis.aids)
 
@@ -54,22 +54,24 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.record, Unavailable):
         return
-    times = ekf2.state.index.to_numpy()
-    times = times[(times >= analysis.segment.start_s) & (times <= analysis.segment.end_s)]
-    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION, times)
+    state_times_s = ekf2.state.index.to_numpy()
+    state_times_s = state_times_s[
+        (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
+    ]
+    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION, state_times_s)
     if not is_bad.any():
         return
-    noises = {
+    small_noise_parameters = {
         AIDS[name].noise
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
     cause = "Random innovations can set this flag for some seconds."
     remedy = "If it lasts longer, check the IMU for vibration and clipping."
-    if noises:
+    if small_noise_parameters:
         cause = "EKF2's noise parameters of these sensors are too small."
-        remedy = f"Increase {' and '.join(sorted(noises))} to the true noise."
-    bad_fraction, start_s = float(is_bad.mean()), float(times[is_bad.argmax()])
+        remedy = f"Increase {' and '.join(sorted(small_noise_parameters))} to the true noise."
+    bad_fraction, start_s = float(is_bad.mean()), float(state_times_s[is_bad.argmax()])
     yield finding(
         "warning" if bad_fraction > MAX_BAD_FRACTION_NOTE else "note",
         "ekf2_acceleration_bad",
@@ -93,40 +95,44 @@ def detect_in_aids(
     error in the longest gap of the barometer if it is larger than in the rest of the flight.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
-    not_fused: dict[str, list[AidResult]] = {}
+    unfused_aids_by_switch: dict[str, list[AidResult]] = {}
     for name, aid in tested_aids.items():
         is_take_off_gap = name == BAROMETER.name and any(
             start <= aid.longest_gap_s[0] <= start + TAKE_OFF_S for start in take_off_s
         )
         if aid.verdict == "not_fused" and not is_take_off_gap:
-            not_fused.setdefault(AIDS[name].switch or name, []).append(aid)
-    for switch, aids_of_sensor in not_fused.items():
+            unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
+    for switch, aids_of_sensor in unfused_aids_by_switch.items():
         longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
-        labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
-        has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
-        is_barometer, effect = switch == BAROMETER.switch, ""
+        aid_labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
+        has_innovation_shift = any(
+            axis.change for aid in aids_of_sensor for axis in aid.axes.values()
+        )
+        is_barometer, height_error_text = switch == BAROMETER.switch, ""
         if is_barometer and height_error_m is not None:
-            effect = f": EKF2's height error is {height_error_m:.2f} m"
+            height_error_text = f": EKF2's height error is {height_error_m:.2f} m"
         yield finding(
-            "note" if is_barometer and not effect else "warning",
+            "note" if is_barometer and not height_error_text else "warning",
             "aid_not_fused",
-            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} "
-            f"s{effect}. EKF2 rejected {format_percent(longest_unfused.rejected_fraction)} of the "
-            "samples, and relied on the IMU and other aiding sources.",
-            CHECKS.get(switch, OTHER_CHECK),
+            f"EKF2 fused no sample of {aid_labels} for "
+            f"{longest_unfused.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
+            f"{format_percent(longest_unfused.rejected_fraction)} of the samples, and relied on "
+            "the IMU and other aiding sources.",
+            CHECKS.get(switch, DEFAULT_CHECK),
             {
-                "aid": labels,
+                "aid": aid_labels,
                 "longest_gap_s": longest_unfused.longest_gap_duration_s,
                 "rejected_fraction": longest_unfused.rejected_fraction,
-                CAUSE: _sensor_cause(switch, source_aid) or (CHANGE if has_change else ""),
+                CAUSE: _sensor_cause(switch, source_aid)
+                or (CHANGE if has_innovation_shift else ""),
             },
             (longest_unfused.longest_gap_s,),
         )
     for name, aid in tested_aids.items():
-        changes = {axis: result.change for axis, result in aid.axes.items() if result.change}
+        shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
         label, switch = _aid_label(aid), AIDS[name].switch
-        if changes and not _sensor_cause(switch, source_aid):
-            axis, (time_s, shift) = max(changes.items(), key=lambda item: abs(item[1][1]))
+        if shifts_by_axis and not _sensor_cause(switch, source_aid):
+            axis, (time_s, shift) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
             s_sqrt = aid.axes[axis].s_sqrt_median
             yield warning(
                 "aid_innovation_shift",
@@ -143,16 +149,16 @@ def detect_in_aids(
             action = "Then correct the accuracy that the sensor reports."
             if noise_parameter := AIDS[name].noise:
                 action = f"Then increase {noise_parameter}."
-            noise = ""
+            noise_text = ""
             if aid.noise is not None:
-                noise = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
+                noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
             yield warning(
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
                 f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), "
                 f"and {format_percent(aid.rejected_fraction)} of the samples are rejected. The "
-                f"errors of this aiding source are larger than its √R{noise}, or another aiding "
-                "source is wrong.",
+                f"errors of this aiding source are larger than its √R{noise_text}, or another "
+                "aiding source is wrong.",
                 f"Check delay and mounting of the sensor first. {action}",
                 {
                     "aid": name,
@@ -181,16 +187,16 @@ def detect_in_aids(
             )
 
 
-def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
-    down = analysis.axes.get("down")
-    errors = None if down is None else position_errors(down, "ekf2")
+def _large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
+    down_comparison = analysis.axes.get("down")
+    errors = None if down_comparison is None else position_errors(down_comparison, "ekf2")
     if errors is None or isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
-    largest_m = float(error_m[is_in_span].max())
-    return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
+    largest_error_m = float(error_m[is_in_span].max())
+    return largest_error_m if largest_error_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
 
 
 def _aid_label(aid: AidResult) -> str:

@@ -8,7 +8,7 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, group_by_root
 
-# Key in Finding.evidence: kind of cause that a re-run has confirmed
+# Key in Finding.evidence: kind of cause, one of the constants below
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,9 +20,9 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes (only if large)
+# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes, if large
 WHITE_RATIO = "white_over_assumed"
-# Kind of cause: the aiding source and the positions of KF are from the same sensor
+# Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"
 # Kind of cause: the mean innovation of the aiding source changes in flight
 CHANGE = "change"
@@ -34,13 +34,13 @@ GROUND = "never took off"
 CONVENTION = "convention"
 # Key in Finding.evidence: time (s) of a position jump with an increment of reset_counter
 ANNOUNCED = "reset_at_s"
-# Findings that explain others only if their severity is above note
+# Findings that explain other findings only as warning or error
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
-# Effects whose action corrects their cause, too, so that either action is enough
+# Effects that keep their own action, because it also corrects their cause
 ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
-# Ids of the effects of each finding, one per line
+# Ids of the findings that each finding causes, one per line
 CONSEQUENCES: Mapping[str, str] = read_toml(__file__, "consequences.toml", dict[str, str])
 
 

@@ -43,9 +43,9 @@ def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
     )
 
 
-def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
+def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
     return any(
-        (trial.filter, trial.change) == (owner, cause.change)
+        (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
         and improvement(trial) == "nothing"
         for trial in analysis.main_trials
@@ -104,12 +104,12 @@ def format_shift(shift_s: float) -> str:
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:
     """Format the action "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
-    texts = (
+    setting_texts = (
         f"{name[:7].upper()} to {value:g} {SETTING_RANGES[name].unit} "
         f"({COMPARISON_OPTIONS[name]} {value:g})"
         for name, value in sorted(settings.items())
     )
-    return f"Set {' and '.join(texts)}."
+    return f"Set {' and '.join(setting_texts)}."
 
 
 def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
@@ -122,17 +122,18 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             direction = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {direction})"
         case trials.FORWARD_BIAS:
-            right = cause.change[trials.RIGHT_BIAS]
+            right_bias = cause.change[trials.RIGHT_BIAS]
             return (
-                f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} m/s² right)"
+                f"accelerometer bias removed ({value:+.2f} m/s² forward, {right_bias:+.2f} m/s² "
+                "right)"
             )
         case trials.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
-            mean = " on average" if is_drifting else ""
+            average_text = " on average" if is_drifting else ""
             return (
-                f"EKF2's heading corrected (error {value:+.0f}°{mean})"
+                f"EKF2's heading corrected (error {value:+.0f}°{average_text})"
                 if analysis.source.origin.is_gnss
-                else f"positions rotated by {value:+.0f}°{mean}"
+                else f"positions rotated by {value:+.0f}°{average_text}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
             label, unit = name[:7].upper(), SETTING_RANGES[name].unit

@@ -29,12 +29,12 @@ def detect(analysis: Analysis) -> Findings:
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
     sensor = source_name(analysis.source)
-    is_shared = analysis.source.origin.is_gnss and math.isclose(
+    has_kf_same_noise = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )
-    rejected = analysis.main.rejected_fraction or 0.0
-    if rejected >= MIN_NAMED_REJECTION:
-        effect_text = f": EKF2 rejects {format_percent(rejected)} of the positions"
+    rejected_fraction = analysis.main.rejected_fraction or 0.0
+    if rejected_fraction >= MIN_NAMED_REJECTION:
+        effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor} noise as outliers and relies on the IMU."
     else:
         effect_text, gain = "", "large" if is_small else "small"
@@ -42,18 +42,26 @@ def detect(analysis: Analysis) -> Findings:
     title = f"{aid.noise} is {format_factor(factor)} times too {direction}{effect_text}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
     if is_small and is_default:  # with PX4's default, name the sensor, not the parameter
-        assumed = "KF and EKF2 assume" if is_shared else "EKF2 assumes"
-        title = f"{sensor} noise is {format_factor(factor)} times what {assumed}{effect_text}"
-    interval, tuned = "", analysis.tuning.get(HORIZONTAL)
-    if isinstance(tuned, AxisTuning) and tuned.sigma_z.low and tuned.sigma_z.high:
-        interval = f" (95 % {tuned.sigma_z.low:.3g} to {tuned.sigma_z.high:.3g} m)"
+        assuming_filters = "KF and EKF2 assume" if has_kf_same_noise else "EKF2 assumes"
+        title = (
+            f"{sensor} noise is {format_factor(factor)} times what {assuming_filters}{effect_text}"
+        )
+    interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
+    if (
+        isinstance(horizontal_tuning, AxisTuning)
+        and horizontal_tuning.sigma_z.low
+        and horizontal_tuning.sigma_z.high
+    ):
+        interval_text = (
+            f" (95 % {horizontal_tuning.sigma_z.low:.3g} to {horizontal_tuning.sigma_z.high:.3g} m)"
+        )
     severity: Severity = "error" if factor >= MIN_FACTOR_ERROR else "warning"
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",
         f"{title}. {aid.noise} is {flown_m:g} m; the maximum-likelihood estimate is "
-        f"{estimate_m:.3g} m{interval}. "
-        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_shared else ''}",
+        f"{estimate_m:.3g} m{interval_text}. "
+        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if has_kf_same_noise else ''}",
         f"Set {format_settings(trial.change)}.",
         {"flown_m": flown_m, "estimate_m": estimate_m, "factor": ratio},
     )
@@ -63,9 +71,9 @@ def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     """Return the re-run with another EKF2 noise, if its innovations become consistent."""
     trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
-        classify_sigma_ratio(before, against) != "consistent"
-        and classify_sigma_ratio(after, against) == "consistent"
-        for against, before, after in sigma_ratio_changes(trial)
-        if against == "source"
+        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        and classify_sigma_ratio(ratio_after, reference) == "consistent"
+        for reference, ratio_before, ratio_after in sigma_ratio_changes(trial)
+        if reference == "source"
     )
     return trial if is_confirmed else None

@@ -17,7 +17,7 @@ from px4fuse.findings.model import (
     Findings,
     finding,
     format_percent,
-    fraction_on,
+    fraction_of_ones,
     note,
     spans_with_value,
     warning,
@@ -25,15 +25,14 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_phrase
 from px4fuse.flight.position_source import POSITION_FILE
 
-# Fraction of the time in which EKF2 fuses the source, below which the severity is error
+# Fraction of the time with fusion of the source by EKF2, below which the severity is error
 MIN_FUSED_FRACTION_ERROR = 0.5
-# Fraction of the time below which the severity is warning: 2 % of a minute are about 1 s
+# Fraction of the time with fusion of the source below which the severity is warning
 MIN_FUSED_FRACTION_WARNING = 0.98
-# Position interval (s) above which EKF2 may start fusion late: 10 % jitter reaches
-# EV_START_INTERVAL_S
+# Minimum interval (s) between positions at which EKF2 may start fusion late because of jitter
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) from EKF2 to ground truth or source for the finding of an invalid position
+# Minimum distance (m) of EKF2's invalid position from ground truth or source, for a finding
 MIN_INVALID_DISTANCE_M = 1.0
 
 
@@ -49,10 +48,10 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
-    fusing = ekf2.fusion_flags["horizontal"]
-    fused_fraction = fraction_on(fusing, analysis.segment)
+    fusion_flag = ekf2.fusion_flags["horizontal"]
+    fused_fraction = fraction_of_ones(fusion_flag, analysis.segment)
     if fused_fraction >= MIN_FUSED_FRACTION_ERROR:
-        yield from _detect_slow_restart(analysis, ekf2, fusing)
+        yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
     if source is None or fused_fraction >= MIN_FUSED_FRACTION_WARNING:
         return
     positions, aid = positions_phrase(source), source.origin.aid
@@ -72,20 +71,22 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
                 evidence,
             )
         return
-    spans = spans_with_value(0.0, fusing, analysis.segment)
+    spans = spans_with_value(0.0, fusion_flag, analysis.segment)
     longest_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
-    unmet = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
-    evidence["condition"] = unmet.condition
-    action = unmet.action
-    if not unmet.condition and not source.origin.has_all_samples:
+    unmet_condition = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
+    evidence["condition"] = unmet_condition.condition
+    action = unmet_condition.action
+    if not unmet_condition.condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
     title = f"EKF2 fused the {positions} only {format_percent(fused_fraction)} of the time"
     if not fused_fraction:
         title = f"EKF2 never fused the {positions}"
-    message = f"{title}{unmet.fault and ': '}{unmet.fault}. {unmet.reason}"
+    message = (
+        f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
+    )
     if fused_fraction < MIN_FUSED_FRACTION_ERROR:
-        is_reference = source.origin.fused_as_gnss and unmet.condition == "switch"
+        is_reference = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
             "note" if is_reference else "error",
             "ekf2_not_fusing",
@@ -117,7 +118,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     is_valid = ekf2.states.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
-    invalid_fraction = 1.0 - fraction_on(is_valid, analysis.segment)
+    invalid_fraction = 1.0 - fraction_of_ones(is_valid, analysis.segment)
     if invalid_fraction <= 1.0 - MIN_FUSED_FRACTION_WARNING:
         return
     spans = spans_with_value(0.0, is_valid, analysis.segment)
@@ -125,14 +126,16 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if distance_m < MIN_INVALID_DISTANCE_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
-    distance = f" EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
+    distance_sentence = (
+        f" EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
+    )
     if not np.isfinite(distance_m):
-        distance = ""
+        distance_sentence = ""
     yield finding(
         "error" if invalid_fraction > MIN_FUSED_FRACTION_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
-        f"(xy_valid 0), and PX4 does not use it.{distance}",
+        f"(xy_valid 0), and PX4 does not use it.{distance_sentence}",
         "Restore the fusion of positions first. EKF2's errors in this time do not depend on "
         "noise settings.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
@@ -142,17 +145,18 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
     """Return EKF2's largest horizontal distance (m) to ground truth, else to the source."""
-    truth, axes = analysis.flight.truth, ["north_m", "east_m"]
+    truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
-    state = pd.concat([ekf2.state[axes].loc[start:end] for start, end in spans])
-    errors = [
-        state[axis] - np.interp(state.index, reference.index, reference[axis], np.nan, np.nan)
-        for axis in axes
+    invalid_state = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
+    distances_m = [
+        invalid_state[axis]
+        - np.interp(invalid_state.index, reference.index, reference[axis], np.nan, np.nan)
+        for axis in columns
     ]
-    return float(np.hypot(*errors).max())
+    return float(np.hypot(*distances_m).max())
 
 
-def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
+def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusion_flag: pd.Series) -> Findings:
     """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
     source = analysis.source
     if (
@@ -164,23 +168,28 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
     ):
         return
     time_s = source.samples.index.to_numpy()
-    resumed_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
-    late_spans = []
-    for start_s, end_s in spans_with_value(0.0, fusing, analysis.segment):
-        after_gap_s = resumed_s[(resumed_s > start_s - EV_STOP_INTERVAL_S) & (resumed_s < end_s)]
-        if not len(after_gap_s):
+    gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
+    restart_delay_spans = []
+    for start_s, end_s in spans_with_value(0.0, fusion_flag, analysis.segment):
+        gap_ends_without_fusion_s = gap_ends_s[
+            (gap_ends_s > start_s - EV_STOP_INTERVAL_S) & (gap_ends_s < end_s)
+        ]
+        if not len(gap_ends_without_fusion_s):
             continue
-        waiting_s = time_s[(time_s >= after_gap_s[-1]) & (time_s < end_s)]
-        if len(waiting_s) > 2 and waiting_s[1] - waiting_s[0] >= EV_START_INTERVAL_S:
-            late_spans.append((float(waiting_s[0]), end_s))
-    if late_spans:
-        longest_s = max(end - start for start, end in late_spans)
+        unfused_times_s = time_s[(time_s >= gap_ends_without_fusion_s[-1]) & (time_s < end_s)]
+        if (
+            len(unfused_times_s) > 2
+            and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
+        ):
+            restart_delay_spans.append((float(unfused_times_s[0]), end_s))
+    if restart_delay_spans:
+        longest_s = max(end - start for start, end in restart_delay_spans)
         yield note(
             "source_rate_at_limit",
             f"{positions_phrase(source)} come at {source.rate_hz:.1f} Hz, so EKF2 "
             f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
             f"fusion only if two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(late_spans)},
-            tuple(late_spans),
+            {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
+            tuple(restart_delay_spans),
         )

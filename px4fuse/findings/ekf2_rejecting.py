@@ -20,9 +20,9 @@ from px4fuse.flight.model import Ekf2, Unavailable
 # Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
 # rejects 6e-7
 REJECTED_FRACTION_WARNING = 0.01
-# Minimum fraction of rejected samples for severity error: R or the time offset must be wrong
+# Minimum fraction of rejected samples for severity error
 REJECTED_FRACTION_ERROR = 0.20
-# A changed setting prevents rejections if it reduces their fraction to this part
+# Maximum ratio of the rejected fractions with and without a change that prevents rejections
 MAX_REJECTED_RATIO = 0.5
 
 
@@ -40,37 +40,40 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
         expected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected_fraction >= REJECTED_FRACTION_WARNING:
             aid = aid_of(analysis)
-            rejected = float(rejections[0].evidence["rejected_fraction"])
+            rejected_fraction = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
                 rejections[0].severity,
                 "ekf2_gate_too_small",
-                f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects {format_percent(rejected)} "
-                "of the positions. Without any fault, this gate rejects "
-                f"{format_percent(expected_fraction)} of the positions. Rejected positions do not "
-                "correct EKF2.",
+                f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
+                f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
+                f"gate rejects {format_percent(expected_fraction)} of the positions. Rejected "
+                "positions do not correct EKF2.",
                 f"Set {aid.gate} to {aid.default_gate:g} (PX4's default).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected_fraction},
             )
 
 
 def _detect_rejections(analysis: Analysis) -> Findings:
-    ekf2, down = analysis.flight.ekf2, analysis.axes.get("down")
+    ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
     # EKF2 rejects north and east together, so the main axis represents both
-    for result in (analysis.main, *([down] if down and down is not analysis.main else [])):
+    for result in (
+        analysis.main,
+        *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
+    ):
         innovations = result.ekf2_innovations
         if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
         rejected_flags = innovations["rejected"].dropna()
         rejected_fraction = float(rejected_flags.mean())  # NaN if the log has no rejections
         if rejected_fraction >= REJECTED_FRACTION_WARNING:
-            quantity = "heights" if result is down else "positions"
+            quantity = "heights" if result is down_comparison else "positions"
             yield finding(
                 "error" if rejected_fraction >= REJECTED_FRACTION_ERROR else "warning",
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
                 f"innovations are outside its gate of {ekf2.gate:g} √S. Possible causes: outliers, "
                 "measurement noise set too small, or late timestamps.",
-                _remedy(analysis, result),
+                _rejection_remedy(analysis, result),
                 {
                     "rejected_fraction": rejected_fraction,
                     "count": len(innovations),
@@ -80,11 +83,11 @@ def _detect_rejections(analysis: Analysis) -> Findings:
             )
 
 
-def _remedy(analysis: Analysis, result: AxisComparison) -> str:
+def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = aid_of(analysis, result.axis.name)
-    trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
-    if trials and result is analysis.main:
-        return format_action(analysis, min(trials, key=preference).change)
+    helpful_trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
+    if helpful_trials and result is analysis.main:
+        return format_action(analysis, min(helpful_trials, key=preference).change)
     return (
         f"Check {source_words(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
         f"Increase {aid.gate} last."
@@ -92,7 +95,7 @@ def _remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
-    if before is None or after is None or improvement(trial) == "nothing":
+    rejected_before, rejected_after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    if rejected_before is None or rejected_after is None or improvement(trial) == "nothing":
         return False
-    return len(trial.kinds) == 1 and after < MAX_REJECTED_RATIO * before
+    return len(trial.kinds) == 1 and rejected_after < MAX_REJECTED_RATIO * rejected_before

@@ -12,15 +12,15 @@ from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is usual
 TAKE_OFF_S = 10.0
-# Maximum time (s) from the end of a gap in the source to the position reset that the gap causes
-AFTER_GAP_S = 5.0
+# Maximum time (s) from the end of a gap in the source to a position reset caused by the gap
+MAX_RESET_DELAY_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    resets = [
+    position_resets = [
         reset
         for reset in ekf2.resets
         if segment.start_s < reset.time_s <= segment.end_s
@@ -28,47 +28,51 @@ def detect(analysis: Analysis) -> Findings:
         and any(reset.delta)
         and not _is_take_off_height_reset(analysis, reset)
     ]
-    if resets:
-        horizontal = [reset for reset in resets if any(reset.delta[:2])]
-        resets_to_report = horizontal or resets
-        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in resets_to_report]
+    if position_resets:
+        horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
+        reported_resets = horizontal_resets or position_resets
+        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in reported_resets]
         follows_gap = all(
-            any(start <= reset.time_s <= end + AFTER_GAP_S for start, end in analysis.events.gaps)
-            for reset in resets_to_report
+            any(
+                start <= reset.time_s <= end + MAX_RESET_DELAY_S
+                for start, end in analysis.events.gaps
+            )
+            for reset in reported_resets
         )
-        at_s = resets_to_report[int(np.argmax(sizes_m))].time_s
-        _, treatment = continuous_state(ekf2, analysis.source, analysis.segment)
-        if treatment:
-            treatment = f" In the comparison: {treatment}."
+        largest_reset_s = reported_resets[int(np.argmax(sizes_m))].time_s
+        _, reset_treatment = continuous_state(ekf2, analysis.source, analysis.segment)
+        if reset_treatment:
+            reset_treatment = f" In the comparison: {reset_treatment}."
         yield finding(
-            "warning" if horizontal else "note",
+            "warning" if horizontal_resets else "note",
             "ekf2_resets",
-            f"EKF2 reset its {'horizontal position' if horizontal else 'height'} "
+            f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
             f"{format_count(len(sizes_m))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
-            f"{at_s:.1f} s.{treatment}",
-            f"Run px4fuse explore LOG and compare position and innovation at {at_s:.1f} s.",
+            f"{largest_reset_s:.1f} s.{reset_treatment}",
+            f"Run px4fuse explore LOG and compare position and innovation at {largest_reset_s:.1f} "
+            "s.",
             {
                 "count": len(sizes_m),
                 "largest_m": max(sizes_m),
-                "at_s": at_s,
+                "at_s": largest_reset_s,
                 CAUSE: GAP if follows_gap else ELSEWHERE,
             },
-            zero_length_spans(reset.time_s for reset in resets_to_report),
+            zero_length_spans(reset.time_s for reset in reported_resets),
         )
     yield from detect_instance_switches(ekf2, (segment.start_s, segment.end_s))
 
 
 def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
     """Detect changes of the primary EKF2 instance in a time span (s)."""
-    switches = [time for time, _ in ekf2.instances if span_s[0] < time <= span_s[1]]
-    if switches:
+    switch_times_s = [time for time, _ in ekf2.instances if span_s[0] < time <= span_s[1]]
+    if switch_times_s:
         yield warning(
             "ekf2_instance_switch",
-            f"The primary EKF2 instance changed {format_count(len(switches))}, first at "
-            f"{switches[0]:.1f} s. The comparison uses the primary instance at each time.",
+            f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
+            f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
             "Compare the IMUs (vehicle_imu_status). Set EKF2_MULTI_IMU to 1 for a lab flight.",
-            {"count": len(switches), "at_s": switches[0]},
-            zero_length_spans(switches),
+            {"count": len(switch_times_s), "at_s": switch_times_s[0]},
+            zero_length_spans(switch_times_s),
         )
 
 

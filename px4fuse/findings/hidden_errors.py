@@ -31,12 +31,12 @@ from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
-# Minimum mean NEES for severity error: position errors of 4 reported σ
+# Minimum mean NEES for severity error: the RMS position error is 4 reported σ
 MIN_NEES_ERROR = 16.0
-# EKF2 alone is at fault if the position RMSE of KF is below this fraction of EKF2's
+# Maximum ratio of the position RMSEs of KF and EKF2 if only EKF2 has a fault
 MAX_KF_ERROR_RATIO = 0.7
-# A frame is misaligned if an alignment reduces the position RMSE below this fraction
-MAX_ALIGNED_FRACTION = 0.5
+# Maximum ratio of the position RMSEs after and before alignment for a misaligned frame
+MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
     "loop LOG) corrects the path of this flight, not the filters."
@@ -66,7 +66,7 @@ class AlignedError(NamedTuple):
 
     @property
     def is_misaligned(self) -> bool:
-        return self.after_m < MAX_ALIGNED_FRACTION * self.before_m
+        return self.after_m < MAX_ALIGNED_RMSE_RATIO * self.before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -90,55 +90,61 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
 def detect(analysis: Analysis) -> Findings:
     if hidden_errors := find_hidden_errors(analysis):
-        yield make_error_finding(analysis, hidden_errors)
+        yield make_hidden_error_finding(analysis, hidden_errors)
     elif analysis.source.origin.may_drift:
         yield make_possible_drift_finding(analysis)
 
 
-def make_error_finding(
+def make_hidden_error_finding(
     analysis: Analysis, hidden_errors: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
     hidden_errors = sorted(hidden_errors, key=lambda entry: entry[1] != analysis.main.axis.name)
-    worst_filter, main_axis, worst = hidden_errors[0]
+    worst_filter, main_axis, worst_error = hidden_errors[0]
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
-    ratios, sentences = dict[str, float](), list[str]()
-    causes = dict[FilterName, Trial]()
+    ratio_by_filter, sentences = dict[str, float](), list[str]()
+    cause_by_filter = dict[FilterName, Trial]()
     for filter_name in FILTERS:
         label = filter_name.upper()
-        for _, axis, excess in [entry for entry in hidden_errors if entry[0] == filter_name][:1]:
-            if excess.nis_mean is not None:
-                evidence[f"{filter_name}_nis_mean"] = excess.nis_mean
+        for _, axis, hidden_error in [entry for entry in hidden_errors if entry[0] == filter_name][
+            :1
+        ]:
+            if hidden_error.nis_mean is not None:
+                evidence[f"{filter_name}_nis_mean"] = hidden_error.nis_mean
             evidence |= {
-                f"{filter_name}_nees_position_mean": excess.nees,
-                f"{filter_name}_position_rmse_m": excess.rmse_m,
-                f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
+                f"{filter_name}_nees_position_mean": hidden_error.nees,
+                f"{filter_name}_position_rmse_m": hidden_error.rmse_m,
+                f"{filter_name}_sigma_p_m": hidden_error.reported_sigma_m,
             }
             cause = find_cause(analysis.trials, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
-                causes[filter_name] = cause
-            ratios[label] = excess.nees**0.5
+                cause_by_filter[filter_name] = cause
+            ratio_by_filter[label] = hidden_error.nees**0.5
             sentences.append(
-                f"{label}: position RMSE {format_metres(excess.rmse_m)} m along "
+                f"{label}: position RMSE {format_metres(hidden_error.rmse_m)} m along "
                 f"{analysis.axes[axis].axis.label}, reported σ "
-                f"{format_metres(excess.reported_sigma_m)} m."
+                f"{format_metres(hidden_error.reported_sigma_m)} m."
             )
-    cause = causes.get(worst_filter) or next(iter(causes.values()), None)
+    cause = cause_by_filter.get(worst_filter) or next(iter(cause_by_filter.values()), None)
     evidence |= {CAUSE: kind_of_cause(analysis, cause)}
-    aligned = None if causes else _rmse_after_alignment(analysis, worst_filter)
-    if aligned is not None:
+    aligned_error = None if cause_by_filter else _rmse_after_alignment(analysis, worst_filter)
+    if aligned_error is not None:
         evidence |= {
-            "position_rmse_horizontal_m": aligned.before_m,
-            "position_rmse_aligned_m": aligned.after_m,
+            "position_rmse_horizontal_m": aligned_error.before_m,
+            "position_rmse_aligned_m": aligned_error.after_m,
         }
-    is_misaligned = aligned is not None and aligned.is_misaligned
-    if analysis.source.origin.may_drift and not causes and not is_misaligned:
-        return _drift_finding(analysis, aligned, worst, evidence, tuple(ratios))
-    if is_misaligned and aligned is not None:
-        sentences.append(f"The position frame is misaligned: horizontal position RMSE {aligned}.")
+    is_misaligned = aligned_error is not None and aligned_error.is_misaligned
+    if analysis.source.origin.may_drift and not cause_by_filter and not is_misaligned:
+        return _drift_finding(
+            analysis, aligned_error, worst_error, evidence, tuple(ratio_by_filter)
+        )
+    if is_misaligned and aligned_error is not None:
+        sentences.append(
+            f"The position frame is misaligned: horizontal position RMSE {aligned_error}."
+        )
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_truth, ErrorsAgainstTruth)
-        and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
+        and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst_error.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden_errors)
     remedy = (
@@ -151,10 +157,12 @@ def make_error_finding(
         remedy = FRAME_REMEDY
     elif is_ekf2_alone:
         remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
-    sizes = (f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratios.items())
-    title = f"Position errors that innovations do not show: {', '.join(sizes)}"
+    ratio_texts = (
+        f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratio_by_filter.items()
+    )
+    title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
     return finding(
-        "error" if worst.nees >= MIN_NEES_ERROR else "warning",
+        "error" if worst_error.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",
         f"{title}. {' '.join(sentences)}",
         remedy,
@@ -164,34 +172,40 @@ def make_error_finding(
 
 def _drift_finding(
     analysis: Analysis,
-    aligned: AlignedError | None,
-    worst: ErrorAboveSigma,
+    aligned_error: AlignedError | None,
+    worst_error: ErrorAboveSigma,
     evidence: Mapping[str, float | str],
     filter_labels: tuple[str, ...],
 ) -> Finding:
     """Make the finding of a drift that the innovations of ``filter_labels`` do not show."""
     sensor, loop = source_name(analysis.source), analysis.loop
-    size = f"position RMSE {format_metres(worst.rmse_m)} m against ground truth"
-    sentence = ""
-    if aligned is not None:
-        size = (
-            f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
+    drift_size = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
+    rmse_sentence = ""
+    if aligned_error is not None:
+        drift_size = (
+            f"horizontal position RMSE {format_metres(aligned_error.after_m)} m after the best "
+            "alignment"
         )
-        sentence = f"Before the alignment the RMSE is {format_metres(aligned.before_m)} m. "
-    if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
+        rmse_sentence = (
+            f"Before the alignment the RMSE is {format_metres(aligned_error.before_m)} m. "
+        )
+    if isinstance(loop, Loop) and (closure_error_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
-        evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
-        sentence = "" if aligned is None else f"Horizontal position RMSE {aligned}. "
-        size = (
-            f"loop closure error {format_metres(gap_m)} m after a path of {length_m:.0f} m "
-            f"({format_percent(gap_m / length_m, 1)})"
+        evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
+        rmse_sentence = (
+            "" if aligned_error is None else f"Horizontal position RMSE {aligned_error}. "
+        )
+        drift_size = (
+            f"loop closure error {format_metres(closure_error_m)} m after a path of {length_m:.0f} "
+            f"m ({format_percent(closure_error_m / length_m, 1)})"
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
-    noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
+    noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {size}. {sentence}The innovations of {' and '.join(filter_labels)} do "
-        f"not show the drift, because the filter follows {sensor}. Do not reduce {noises}.",
+        f"{sensor} drifts: {drift_size}. {rmse_sentence}The innovations of "
+        f"{' and '.join(filter_labels)} do not show the drift, because the filter follows "
+        f"{sensor}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -205,18 +219,19 @@ def _known_closure_error_m(loop: Loop) -> float | None:
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
     """Return the horizontal RMSE before and after a fit of position and yaw to ground truth."""
-    error, true_track = [], []
+    axis_errors_m, true_positions_m = [], []
     for result in north_and_east(comparison):
         errors, truth = position_errors(result, filter_name), result.truth
         if isinstance(errors, Unavailable) or isinstance(truth, Unavailable):
             return None
-        error.append(errors["error_m"])
-        true_track.append(np.interp(errors.index, truth.index, truth["position_m"]))
-    if len(error) < 2:
+        axis_errors_m.append(errors["error_m"])
+        true_positions_m.append(np.interp(errors.index, truth.index, truth["position_m"]))
+    if len(axis_errors_m) < 2:
         return None
-    zero_height, is_known = np.zeros(len(error[0])), np.isfinite(error).all(axis=0)
+    zero_height, is_known = np.zeros(len(axis_errors_m[0])), np.isfinite(axis_errors_m).all(axis=0)
     error_m, true_m = (
-        np.column_stack([*columns, zero_height])[is_known] for columns in (error, true_track)
+        np.column_stack([*columns, zero_height])[is_known]
+        for columns in (axis_errors_m, true_positions_m)
     )
     try:
         aligned_m = fit_alignment(true_m + error_m, true_m, "yaw").apply(true_m + error_m)
@@ -230,24 +245,26 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
     sensor, loop = source_name(analysis.source), analysis.loop
-    tuned = analysis.tuning.get(HORIZONTAL)
+    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
         f"{sensor} may drift: its messages contain a heading, so it may be odometry. Innovations "
         f"show how well a filter follows {sensor}, not the position error."
     )
-    if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
-        prefix = "at most " if tuned.sigma_z.value is None else ""
-        evidence |= {"short_term_noise_m": noise}
-        message += f" The position noise without drift is {prefix}{noise:.2g} m."
-    if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
-        evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
+    if isinstance(horizontal_tuning, AxisTuning) and (
+        noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
+    ):
+        bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
+        evidence |= {"short_term_noise_m": noise_m}
+        message += f" The position noise without drift is {bound_text}{noise_m:.2g} m."
+    if isinstance(loop, Loop) and (closure_error_m := loop.closure_error_m) is not None:
+        evidence |= {"closure_error_m": closure_error_m, "path_length_m": loop.path_length_m}
         message += (
-            f" The loop closure error is {format_metres(gap_m)} m after a path of "
+            f" The loop closure error is {format_metres(closure_error_m)} m after a path of "
             f"{loop.path_length_m:.0f} m."
         )
     action = (
-        "Measure the drift with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). "
-        "If the source is motion capture, run again with --source-kind mocap."
+        "Measure the drift from the loop closure error (px4fuse loop LOG) or with ground truth "
+        "(ATT_POS_MOCAP). If the source is motion capture, run again with --source-kind mocap."
     )
     return note("source_may_drift", message, action, evidence)

@@ -13,12 +13,12 @@ from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
-# Maximum specific force (m/s²) of real sensors, 35 g: the largest range is 32 g
-MAX_FORCE_M_S2 = 343.0
+# Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
+MAX_SPECIFIC_FORCE_M_S2 = 343.0
 # Minimum number of samples with impossible values for a finding
 MIN_IMPOSSIBLE_SAMPLES = 3
-# Minimum accelerometer bias (m/s²) for severity error: its position error is 0.15 m after 1 s
-BIAS_ERROR_M_S2 = 0.3
+# Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
+MIN_BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 # Minimum time (s) without IMU samples for a finding: two prediction steps of KF
@@ -29,12 +29,12 @@ MIN_IMU_RATE_HZ = 50.0
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
 MAX_CLIPPED_S = 0.1
-# Minimum time (s) without clipping between two reported time spans of clipping
+# Minimum time (s) between two clipped samples in different reported time spans
 MIN_CLIPPING_PAUSE_S = 2.0
 # Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
 HIGH_RATE_BIT = 16
-# Minimum ratio of the measured to the needed rate: measured rates are up to 2 % below nominal
-RATE_MARGIN = 0.98
+# Minimum ratio of measured to needed sample rate: measured rates are up to 2 % below nominal
+MIN_RATE_RATIO = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -54,7 +54,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         return
     samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
     force_m_s2 = np.linalg.norm(samples.to_numpy(), axis=1)
-    time_s = samples.index[force_m_s2 > MAX_FORCE_M_S2].to_numpy()
+    time_s = samples.index[force_m_s2 > MAX_SPECIFIC_FORCE_M_S2].to_numpy()
     if len(time_s) < MIN_IMPOSSIBLE_SAMPLES:
         return
     yield error(
@@ -72,38 +72,39 @@ def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
     if isinstance(fit, SystematicErrors) and fit.has_bias:
-        forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
+        forward_bias, right_bias, bias_m_s2 = fit.forward_bias, fit.right_bias, fit.bias.value
         message = (
-            f"The accelerometer is biased by {forward.value:+.2f} m/s² forward and "
-            f"{right.value:+.2f} m/s² right. The estimate is from the positions (± "
-            f"{1.96 * forward.sigma:.2f} m/s², 95 %). A tilt error of "
-            f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF does not estimate biases"
+            f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
+            f"{right_bias.value:+.2f} m/s² right. The estimate is from the positions (± "
+            f"{1.96 * forward_bias.sigma:.2f} m/s², 95 %). A tilt error of "
+            f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF does not estimate "
+            "biases."
         )
         if ekf2_bias is not None:
             message += (
-                f"; EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
-                "right"
+                f" EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
+                "right."
             )
         yield finding(
-            "error" if size >= BIAS_ERROR_M_S2 else "warning",
+            "error" if bias_m_s2 >= MIN_BIAS_ERROR_M_S2 else "warning",
             "accelerometer_bias",
-            f"{message}.",
+            message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
+            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
         # the fit shows no horizontal bias, so only the vertical bias is reported
-        size = float(
+        bias_m_s2 = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, SystematicErrors) else ekf2_bias)
         )
-        if size >= MIN_BIAS_M_S2:
+        if bias_m_s2 >= MIN_BIAS_M_S2:
             yield warning(
                 "accelerometer_bias",
-                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s². Its components are "
+                f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
                 f"{ekf2_bias[0]:+.2f} forward, {ekf2_bias[1]:+.2f} right and {ekf2_bias[2]:+.2f} "
                 "down. KF does not estimate biases.",
                 "Calibrate the accelerometers at the temperature of the flight.",
-                {"bias_m_s2": size},
+                {"bias_m_s2": bias_m_s2},
             )
 
 
@@ -139,7 +140,9 @@ def detect_clipping(analysis: Analysis) -> Findings:
     time_s = samples.index[samples["clipped"] > 0.0].to_numpy()
     total_s = len(time_s) / sample_rate(imu)
     if total_s > MAX_CLIPPED_S:
-        bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
+        clipping_bursts_s = np.split(
+            time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1
+        )
         yield warning(
             "accelerometer_clipping",
             f"The accelerometer was clipped for {total_s:.2f} s ({len(time_s)} samples). The log "
@@ -148,7 +151,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
             "without clipping (--start, --end).",
             {"count": len(time_s), "total_s": total_s},
-            tuple((float(burst[0]), float(burst[-1])) for burst in bursts),
+            tuple((float(burst[0]), float(burst[-1])) for burst in clipping_bursts_s),
         )
 
 
@@ -159,7 +162,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
         # KF needs IMU and attitude
-        missing = "IMU" if spans else "Attitude"
+        missing_data = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
             action = "Record on a link without message loss. "
@@ -167,8 +170,8 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Use a faster SD card. "
         yield warning(
             "imu_gap",
-            f"{missing} samples are missing for {gap_s:.2f} s. In this gap KF increases Q to the "
-            "variance of the measured acceleration.",
+            f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases Q to "
+            "the variance of the measured acceleration.",
             f"{action}Analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             spans,
@@ -203,14 +206,14 @@ def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     time_s = imu.index.to_numpy()
     is_gap = imu_gaps(time_s)
     gaps = list(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
-    ends = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
-    gaps += [(start, end) for start, end in ends if end - start > MIN_SPAN_S]
+    end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
+    gaps += [(start, end) for start, end in end_spans if end - start > MIN_SPAN_S]
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)
     return tuple(sorted(gaps_inside))
 
 
 def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
-    return sample_rate(samples) < RATE_MARGIN * needed_hz
+    return sample_rate(samples) < MIN_RATE_RATIO * needed_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:

@@ -1,4 +1,4 @@
-"""False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
+"""False loop closures, too small stated odometry drift, and landing assumed at take-off place."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -6,13 +6,12 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-# Fraction of loop closures rejected by robust optimisation above which the stated odometry drift is
-# too small
-MAX_DROPPED_FRACTION = 0.5
-EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-# Weight below which graduated non-convexity (GNC) rejects a loop closure; final weights are near 0
-# or 1 (Yang et al. 2020)
-MIN_KEPT_WEIGHT = 0.5
+# Maximum fraction of loop closures that robust optimisation rejects if the stated drift is correct
+MAX_REJECTED_CLOSURE_FRACTION = 0.5
+CLOSURE_FIELDS = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
+# Minimum weight of a loop closure that graduated non-convexity (GNC) accepts; final weights are
+# near 0 or 1 (Yang et al. 2020)
+MIN_GNC_WEIGHT = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -23,38 +22,40 @@ def detect(analysis: Analysis) -> Findings:
 def detect_in_loop(loop: Loop) -> Findings:
     """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
-    yield from detect_assumptions(loop)
+    yield from detect_wrong_assumptions(loop)
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
     """Detect loop closures that do not fit the odometry drift or the other loop closures."""
-    weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
-    dropped_count = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
-    drops_most = dropped_count > MAX_DROPPED_FRACTION * len(weights)
-    if drops_most:
+    gnc_weights = [
+        1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
+    ]
+    rejected_count = sum(gnc_weight < MIN_GNC_WEIGHT for gnc_weight in gnc_weights)
+    rejects_most = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(gnc_weights)
+    if rejects_most:
         yield warning(
             "loop_drift_too_small",
-            f"Robust optimisation rejects {dropped_count} of {len(weights)} loop closures. The "
-            "stated odometry drift is probably too small.",
+            f"Robust optimisation rejects {rejected_count} of {len(gnc_weights)} loop closures. "
+            "The stated odometry drift is probably too small.",
             "Increase the stated drift (--drift or --heading-drift).",
-            {"dropped": dropped_count, "closures": len(weights)},
+            {"dropped": rejected_count, "closures": len(gnc_weights)},
         )
-    for closure, weight in zip(loop.closures, weights, strict=True):
+    for closure, gnc_weight in zip(loop.closures, gnc_weights, strict=True):
         if not closure.accepted:
             yield _false_closure(closure, loop.is_end_assumed)
-        elif weight < MIN_KEPT_WEIGHT and not drops_most:
+        elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most:
             yield warning(
                 "loop_closure_inconsistent",
                 f"{closure!s} contradicts the other loop closures. Robust "
                 "optimisation rejects it, although drift could explain its closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
-                _evidence(closure) | {"gnc_weight": weight},
+                _closure_evidence(closure) | {"gnc_weight": gnc_weight},
             )
 
 
-def detect_assumptions(loop: Loop) -> Findings:
-    gap_m = loop.closure_error_m
-    evidence = {} if gap_m is None else {"closure_error_m": gap_m}
+def detect_wrong_assumptions(loop: Loop) -> Findings:
+    closure_error_m = loop.closure_error_m
+    evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
     if loop.is_absolute_track:
         yield warning(
             "loop_on_absolute_positions",
@@ -95,9 +96,9 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
         f"{closure.p:.1g}). Enforcing the closure would deform the whole path.",
         f"{action} If the odometry does drift this much, increase the stated drift (--drift, "
         "--heading-drift).",
-        _evidence(closure),
+        _closure_evidence(closure),
     )
 
 
-def _evidence(closure: Closure) -> dict[str, float]:
-    return {**{name: getattr(closure, name) for name in EVIDENCE}, "alpha": GATE_ALPHA}
+def _closure_evidence(closure: Closure) -> dict[str, float]:
+    return {**{name: getattr(closure, name) for name in CLOSURE_FIELDS}, "alpha": GATE_ALPHA}

@@ -45,11 +45,11 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: Comparison) -> Findings:
     """Detect a log without the positions as PX4 received them."""
-    source, received_rank = analysis.source, RECEIVED.preference_rank
-    is_logged = any(
-        track.origin.preference_rank == received_rank for track in analysis.flight.positions
+    source, received_preference = analysis.source, RECEIVED.preference_rank
+    has_received_positions = any(
+        track.origin.preference_rank == received_preference for track in analysis.flight.positions
     )
-    if source.origin.has_all_samples or is_logged:
+    if source.origin.has_all_samples or has_received_positions:
         return
     rate_hz, parameters = source.rate_hz, analysis.flight.log.parameters
     profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))

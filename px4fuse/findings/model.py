@@ -93,9 +93,10 @@ class SourceWords(Record, frozen=True):
     errors: str
 
 
-_WORDS = read_toml(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+_WORDS_BY_KIND = read_toml(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
 SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
-    kind: SourceWords(**(_WORDS["unknown"] | words)) for kind, words in _WORDS.items()
+    kind: SourceWords(**(_WORDS_BY_KIND["unknown"] | words))
+    for kind, words in _WORDS_BY_KIND.items()
 }
 
 
@@ -152,18 +153,18 @@ def format_percent(fraction: float, digits: int = 0) -> str:
 
 def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
     """Return the time spans of a segment in which a step function has a value."""
-    edges = np.clip(
+    edges_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
     )
-    edges[0] = segment.start_s
-    is_inside = np.diff(edges) > 0.0
+    edges_s[0] = segment.start_s
+    is_inside = np.diff(edges_s) > 0.0
     has_value = np.concatenate([[False], step_function.to_numpy()[is_inside] == value, [False]])
-    edges = np.append(edges[:-1][is_inside], segment.end_s)
-    changes = edges[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
-    return tuple(zip(changes[::2], changes[1::2], strict=True))
+    edges_s = np.append(edges_s[:-1][is_inside], segment.end_s)
+    changes_s = edges_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
+    return tuple(zip(changes_s[::2], changes_s[1::2], strict=True))
 
 
-def fraction_on(step_function: pd.Series, segment: Segment) -> float:
+def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
     """Return the fraction of a segment in which a 0/1 step function is 1."""
-    on_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
-    return on_s / (segment.end_s - segment.start_s)
+    ones_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
+    return ones_s / (segment.end_s - segment.start_s)

@@ -38,7 +38,7 @@ from px4fuse.findings.cause_text import (
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, lower_severity
-from px4fuse.findings.source_positions import hardly_moved
+from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
@@ -49,21 +49,21 @@ from px4fuse.request import COMPARISON_OPTIONS
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
 MIN_NOISE_FACTOR_ERROR = 4.0
-# Time constant (s) of KF above which Q is almost zero: vehicles turn faster
-MIN_RESPONSE_TIME_S = 2.5
+# Minimum time constant (s) of a KF whose Q is almost zero: vehicles turn faster
+MIN_TIME_CONSTANT_S = 2.5
 # Factor on the 95 % interval of a noise estimate (log scale): 0.3 % of correct settings are outside
 INTERVAL_WIDENING = 1.5
-# Lag-1 autocorrelation of the innovations above which KF lags; white innovations have below 0.2
+# Minimum lag-1 autocorrelation of the innovations of a KF that lags; white innovations reach 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
 MIN_SIGMA_FACTOR_ERROR = 2.0
-# Noises within this factor are equal: two standard errors of a median of 100 values
+# Maximum ratio of equal noises: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# EKF2 takes R from the position messages if √R exceeds EKF2_EVP_NOISE by this factor
-MIN_REPORTED_RATIO = 1.25
-# Actions if no re-run explains the wrong σ
-NOT_EXPLAINED = (
+# Minimum ratio of EKF2's √R to EKF2_EVP_NOISE if EKF2 takes R from the position messages
+MIN_REPORTED_NOISE_RATIO = 1.25
+# Action if no re-run explains the wrong σ
+UNEXPLAINED_SIGMA = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
 )
@@ -94,7 +94,7 @@ SETTING_EFFECTS = {
     ),
 }
 
-Member = tuple[AxisComparison, FilterSummary]
+InconsistentAxis = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
@@ -118,7 +118,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         return
     settings = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
     ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
-    if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
+    if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
     wrong_settings = {
         name: deviation
@@ -155,14 +155,14 @@ def _setting_finding(
     estimate, factor, severity = deviation
     setting = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
-    direction, is_bound = "small" if setting < estimate else "large", noise.value is None
+    direction, is_upper_bound = "small" if setting < estimate else "large", noise.value is None
     effect, reason = SETTING_EFFECTS[name, direction]
     action = format_setting_action(analysis, name, estimate)
     return finding(
         "note" if action == NO_IMPROVEMENT else severity,
         f"{name[:7]}_too_{direction}",
-        f"{name[:7].upper()} is {'at least ' if is_bound else ''}{format_factor(factor)} times "
-        f"too {direction}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
+        f"{name[:7].upper()} is {'at least ' if is_upper_bound else ''}{format_factor(factor)} "
+        f"times too {direction}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
         action,
         {
             "chosen": setting,
@@ -198,19 +198,21 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 
 def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate; None if not significant."""
-    if not (value := ml_noise.value or ml_noise.high):
+    if not (estimate := ml_noise.value or ml_noise.high):
         return None
     low, high = (
-        (0.0, value) if ml_noise.value is None else (ml_noise.low or 0.0, ml_noise.high or np.inf)
+        (0.0, estimate)
+        if ml_noise.value is None
+        else (ml_noise.low or 0.0, ml_noise.high or np.inf)
     )
-    low, high = (value * (end / value) ** INTERVAL_WIDENING for end in (low, high))
-    factor = max(setting / value, value / setting)
+    low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING for end in (low, high))
+    factor = max(setting / estimate, estimate / setting)
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_ERROR else "warning"
     if setting == getattr(Settings(), name):  # a default is not a mistake of the user
         severity = lower_severity(severity)
-    return SettingDeviation(value, factor, severity)
+    return SettingDeviation(estimate, factor, severity)
 
 
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
@@ -224,9 +226,9 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
         ):
             continue
-        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        response_s = 1.0 / (sample_rate(updates) * gain)
-        if response_s < MIN_RESPONSE_TIME_S:
+        settled_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        time_constant_s = 1.0 / (sample_rate(updates) * settled_gain)
+        if time_constant_s < MIN_TIME_CONSTANT_S:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
         axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
@@ -238,10 +240,10 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"{title}: KF ignores new positions. {estimate_text}The gain falls to {gain:.2g}. KF "
-            f"needs {response_s:.0f} s to follow a position change.",
+            f"{title}: KF ignores new positions. {estimate_text}The gain falls to "
+            f"{settled_gain:.2g}. KF needs {time_constant_s:.0f} s to follow a position change.",
             action,
-            {"gain": gain, "response_s": response_s, "axis": result.axis.name},
+            {"gain": settled_gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
         return
 
@@ -250,29 +252,34 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
     for filter_name in FILTERS:
         for is_underconfident in (True, False):
             first_id = None
-            for group, axes in AXIS_GROUPS.items():
+            for axis_group, axes in AXIS_GROUPS.items():
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
-                members = [
+                inconsistent_axes = [
                     (result, summary)
                     for result in results
                     if is_inconsistent(summary := result.filters[filter_name])
                     and (summary.sigma_ratio < 1.0) == is_underconfident
                 ]
-                if members:
-                    variance_finding = _variance_finding(analysis, filter_name, group, members)
+                if inconsistent_axes:
+                    variance_finding = _variance_finding(
+                        analysis, filter_name, axis_group, inconsistent_axes
+                    )
                     yield structs.replace(variance_finding, caused_by=first_id)
                     first_id = variance_finding.id
 
 
 def _variance_finding(
-    analysis: Analysis, filter_name: FilterName, group: str, members: list[Member]
+    analysis: Analysis,
+    filter_name: FilterName,
+    axis_group: str,
+    inconsistent_axes: list[InconsistentAxis],
 ) -> Finding:
     result, summary = max(
-        members,
-        key=lambda pair: (pair[0] is analysis.main, abs(np.log(pair[1].nis_mean))),
+        inconsistent_axes,
+        key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
     )
-    is_underconfident, factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
-    severity: Severity = "error" if factor >= MIN_SIGMA_FACTOR_ERROR else "warning"
+    is_underconfident, sigma_factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
+    severity: Severity = "error" if sigma_factor >= MIN_SIGMA_FACTOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
         severity = lower_severity(severity)
     axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
@@ -285,10 +292,16 @@ def _variance_finding(
             _format_excessive_noise(analysis) if filter_name == "ekf2" and not is_barometer else ""
         )
         cause = NOISE if remedy_text else ELSEWHERE
-        fallback = KEEP_NOISES_CORRELATED.format(sensor="a barometer" if is_barometer else "GNSS")
-        severity, remedy_text = severity if remedy_text else "note", remedy_text or fallback
-    elif is_underconfident and filter_name == "ekf2" and (floor := _noise_minimum(analysis)):
-        severity, remedy_text, cause = "note", floor, ELSEWHERE
+        keep_noises_text = KEEP_NOISES_CORRELATED.format(
+            sensor="a barometer" if is_barometer else "GNSS"
+        )
+        severity, remedy_text = severity if remedy_text else "note", remedy_text or keep_noises_text
+    elif (
+        is_underconfident
+        and filter_name == "ekf2"
+        and (minimum_text := _format_noise_minimum(analysis))
+    ):
+        severity, remedy_text, cause = "note", minimum_text, ELSEWHERE
     elif is_underconfident and any(
         name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
     ):
@@ -296,16 +309,16 @@ def _variance_finding(
     else:
         rerun = find_cause(analysis.trials, filter_name, result.axis.name)
         cause = kind_of_cause(analysis, rerun)
-        remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
+        remedy_text = _variance_remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
     low, high = summary.nis_band
     return finding(
         severity,
         f"{filter_name}_{confidence}",
         f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
-        f"{format_ratio(factor)} times too {'large' if is_underconfident else 'small'}. The mean "
-        f"NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
-        "axes).",
+        f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
+        f"mean NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} "
+        f"({axis_group} axes).",
         remedy_text,
         {
             "axis": result.axis.name,
@@ -324,22 +337,24 @@ def _format_excessive_noise(analysis: Analysis) -> str:
         Columns.POSITION_VARIANCE[0]
     ]
     reported_m = float(np.sqrt(reported_variance.median()))
-    tuned = first_axis_tuning(analysis.tuning, HORIZONTAL)
-    noise_m = max(reported_m, (tuned.sigma_z.value if tuned else None) or 0.0)
+    horizontal_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL)
+    noise_m = max(
+        reported_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
+    )
     if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
         return ""
-    source = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
+    noise_origin = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
     return (
-        f"{name} is {parameter_m:g} m, but {source} {noise_m:.2g} m: test the second value with "
-        "px4fuse whatif."
+        f"{name} is {parameter_m:g} m, but {noise_origin} {noise_m:.2g} m: test the second value "
+        "with px4fuse whatif."
     )
 
 
-def _noise_minimum(analysis: Analysis) -> str:
+def _format_noise_minimum(analysis: Analysis) -> str:
     parameters = analysis.flight.log.parameters
     gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
-    is_besides_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
-    if not is_besides_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
+    is_fused_with_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
+    if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
         return ""
     return (
         "No change: while EKF2 fuses GNSS, EKF2's noise of vision positions is at least "
@@ -352,19 +367,21 @@ def _has_default_noises(
 ) -> bool:
     """Return True if the filter uses the default noises of px4fuse (KF) or PX4 (EKF2)."""
     if filter_name == "kf":
-        kf, defaults = analysis.settings, Settings()
-        return all(getattr(kf, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A))
-    parameter = aid_of(analysis, result.axis.name).noise
+        settings, defaults = analysis.settings, Settings()
+        return all(
+            getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
+        )
+    noise_parameter = aid_of(analysis, result.axis.name).noise
     log = analysis.flight.log
-    default = log.default_of(parameter)
-    is_parameter_default = log.parameters.get(parameter, default) == default
+    default = log.default_of(noise_parameter)
+    is_parameter_default = log.parameters.get(noise_parameter, default) == default
     # a variance that the sender reports is a choice of the user, not a default
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
     )
 
 
-def _remedy(
+def _variance_remedy(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
@@ -379,43 +396,48 @@ def _remedy(
     if axis_tuning is None:
         return UNKNOWN_NOISE
     if filter_name == "ekf2" and not reruns:
-        return _remedy_without_replay(analysis, result, axis_tuning)
-    return NOT_EXPLAINED
+        return _variance_remedy_without_replay(analysis, result, axis_tuning)
+    return UNEXPLAINED_SIGMA
 
 
-def _remedy_without_replay(
+def _variance_remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
     aid, noise = aid_of(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
     if not (ml_noise_m := noise.value or noise.high):
-        return NOT_EXPLAINED
-    noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    ratio = ekf2_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_m
+        return UNEXPLAINED_SIGMA
+    noise_m, ekf2_sigma_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
+    ratio = ekf2_sigma_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_sigma_m
     if ratio > NOISE_RATIO_TOLERANCE:
         parameters = analysis.flight.log.parameters
-        is_reported = ekf2_m > MIN_REPORTED_RATIO * parameters.get(aid.noise, np.inf)
+        uses_reported_noise = ekf2_sigma_m > MIN_REPORTED_NOISE_RATIO * parameters.get(
+            aid.noise, np.inf
+        )
         changes = {
             name: value
-            for name, value in noise_change(aid, parameters, ekf2_m * is_reported, noise_m).items()
+            for name, value in noise_change(
+                aid, parameters, ekf2_sigma_m * uses_reported_noise, noise_m
+            ).items()
             if value != parameters.get(name)
         }
         if not changes:
-            return NOT_EXPLAINED
+            return UNEXPLAINED_SIGMA
         return (
-            f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay confirms this "
-            "change: fly again and compare."
+            f"Set {format_settings(changes)} (EKF2 uses {ekf2_sigma_m:.2g} m). No replay confirms "
+            "this change: fly again and compare."
         )
     return (
-        f"EKF2's measurement noise ({ekf2_m:.2g} m) fits the position noise, so another error "
-        "makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
+        f"EKF2's measurement noise ({ekf2_sigma_m:.2g} m) fits the position noise, so another "
+        "error makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, "
+        "vibration)."
     )
 
 
 def ekf2_noise_m(result: AxisComparison) -> float:
     """Return the median √R (m) that EKF2 used; NaN if unknown."""
-    frame = result.ekf2_innovations
-    if isinstance(frame, Unavailable):
+    innovations = result.ekf2_innovations
+    if isinstance(innovations, Unavailable):
         return float("nan")
-    return float(np.sqrt(frame["observation_variance_m2"].median()))
+    return float(np.sqrt(innovations["observation_variance_m2"].median()))

@@ -46,11 +46,11 @@ def detect_lost_data(flight: Flight) -> Findings:
         fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
         if log.damage:
             lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
-            damage = "the log is damaged"
+            damage_text = "the log is damaged"
             if lost_fraction:
                 lost_percent = format_number(100.0 * lost_fraction, 2)
-                damage = f"the log is damaged: {lost_percent} % of its bytes cannot be read"
-            fault = " ".join(f"{_sentence(note)}." for note in (damage, *log.damage))
+                damage_text = f"the log is damaged: {lost_percent} % of its bytes cannot be read"
+            fault = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."
         if not log.damage:
             action = (
@@ -132,5 +132,5 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         )
 
 
-def _sentence(note: str) -> str:
+def _capitalise_note(note: str) -> str:
     return note if "." in note.split(" ", 1)[0] else capitalise_first(note)

@@ -16,7 +16,7 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# No finding if a corrected time offset increases the position RMSE of KF by more than this factor
+# Maximum ratio of KF's position RMSEs with and without the correction of a reported time offset
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
@@ -32,8 +32,12 @@ def detect(analysis: Analysis) -> Findings:
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low pass delays positions, not timestamps
         return
-    low, high = clock.interval_s
-    evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
+    interval_low_s, interval_high_s = clock.interval_s
+    evidence = {
+        "offset_s": clock.offset_s,
+        "interval_low_s": interval_low_s,
+        "interval_high_s": interval_high_s,
+    }
     if clock.changes and clock.change_p_value is not None:
         start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
@@ -46,7 +50,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
             {**evidence, "change_p_value": clock.change_p_value},
         )
         return
-    size_s = abs(clock.remaining_s)
+    offset_size_s = abs(clock.remaining_s)
     # one offset cannot correct timestamps that are arrival times in part of the flight
     if (
         not clock.is_significant(clock.remaining_s)
@@ -54,22 +58,32 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         or _rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
-    interval_s, is_late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
+    interval_s, is_late = (
+        (interval_low_s - clock.applied_s, interval_high_s - clock.applied_s),
+        clock.remaining_s < 0,
+    )
     lower_s, upper_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
     yield finding(
-        "error" if size_s > MIN_OFFSET_ERROR_S else "warning",
+        "error" if offset_size_s > MIN_OFFSET_ERROR_S else "warning",
         "source_time_offset",
-        f"Position timestamps are {size_s:.2f} s {'late' if is_late else 'early'}. The estimate "
-        f"from IMU and positions is {size_s:.3f} s (95 % {lower_s:.3f} to {upper_s:.3f} s). At "
-        f"1 m/s this is a position error of {size_s:.2f} m in KF and EKF2, which innovations "
-        f"hardly show.{_assumed_delay(analysis, clock)}",
+        f"Position timestamps are {offset_size_s:.2f} s {'late' if is_late else 'early'}. The "
+        f"estimate from IMU and positions is {offset_size_s:.3f} s (95 % {lower_s:.3f} to "
+        f"{upper_s:.3f} s). At 1 m/s this is a position error of {offset_size_s:.2f} m in KF and "
+        f"EKF2, which innovations hardly show.{_assumed_delay_sentence(analysis, clock)}",
         _offset_remedy(analysis, clock),
         evidence,
     )
 
 
-def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | None:
-    return next((t for t in analysis.main_trials if (t.filter, t.kinds) == (owner, (kind,))), None)
+def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial | None:
+    return next(
+        (
+            trial
+            for trial in analysis.main_trials
+            if (trial.filter, trial.kinds) == (filter_name, (kind,))
+        ),
+        None,
+    )
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
@@ -79,32 +93,34 @@ def _rmse_ratio(trial: Trial | None) -> float:
     return trial.after.position_rmse_m / trial.before.position_rmse_m
 
 
-def _receiver_delay(analysis: Analysis) -> str | None:
+def _receiver_delay_parameter(analysis: Analysis) -> str | None:
     parameters = analysis.flight.log.parameters
     names = (name for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay) if name in parameters)
     return next(names, None) if analysis.source.origin.fused_as_gnss else None
 
 
-def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
-    name = _receiver_delay(analysis)
-    if name is None:
+def _assumed_delay_sentence(analysis: Analysis, clock: ClockOffset) -> str:
+    delay_parameter = _receiver_delay_parameter(analysis)
+    if delay_parameter is None:
         return ""
-    assumed_ms = analysis.flight.log.parameters[name]
+    assumed_ms = analysis.flight.log.parameters[delay_parameter]
     estimate_ms = max(assumed_ms - 1e3 * clock.remaining_s, 0.0)
-    return f" {name} is {assumed_ms:g} ms; the estimate is {estimate_ms:.0f} ms."
+    return f" {delay_parameter} is {assumed_ms:g} ms; the estimate is {estimate_ms:.0f} ms."
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    if name := _receiver_delay(analysis):
-        return f"Check the delay of the GNSS receiver ({name})."
+    if delay_parameter := _receiver_delay_parameter(analysis):
+        return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
         option_s = clock_offset_option_s(analysis, clock)
         return f"Run again with --clock-offset {option_s:.3f}."
     age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
-    horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
-    delay_action = f", and set {remedy.format_settings(horizon)}" if horizon else ""
-    shift = format_shift(clock.remaining_s)
-    return f"{shift} the timestamp (usec) of each position{delay_action}."
+    horizon_parameters = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
+    delay_action = (
+        f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
+    )
+    shift_text = format_shift(clock.remaining_s)
+    return f"{shift_text} the timestamp (usec) of each position{delay_action}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -121,20 +137,29 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
-    low, high, size = round(low_ms), round(high_ms), round(abs(ml_delay_ms))
+    interval_low_ms, interval_high_ms, delay_size_ms = (
+        round(low_ms),
+        round(high_ms),
+        round(abs(ml_delay_ms)),
+    )
     if low_ms <= 0.0 <= high_ms:
         delay_text = "the positions have no significant delay"
     elif ml_delay_ms < 0.0:
-        delay_text, low, high = f"the timestamps are {size} ms early", -high, -low
+        delay_text, interval_low_ms, interval_high_ms = (
+            f"the timestamps are {delay_size_ms} ms early",
+            -interval_high_ms,
+            -interval_low_ms,
+        )
     else:
-        delay_text = f"the positions are {size} ms late"
-    limit = remedy.delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
+        delay_text = f"the positions are {delay_size_ms} ms late"
+    limit_text = remedy.delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
-        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is {low} to {high} "
-        "ms. EKF2 fuses each position at the wrong time, so its track leads or lags."
-        f"{f' EKF2_EV_DELAY cannot {limit}.' if limit else ''}",
-        CORRECT_AT_SENDER if limit else _delay_remedy(analysis),
+        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
+        f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
+        "so its track leads or "
+        f"lags.{f' EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
+        CORRECT_AT_SENDER if limit_text else _delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
     )
 
@@ -162,7 +187,9 @@ def _delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    ratio = _rmse_ratio(trial)
-    if math.isnan(ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        ratio = trial.after.nis_mean / trial.before.nis_mean
-    return f"Set {remedy.format_settings(trial.change)}." if ratio < 1.0 else CORRECT_AT_SENDER
+    error_ratio = _rmse_ratio(trial)
+    if math.isnan(error_ratio) and trial.before.nis_mean and trial.after.nis_mean:
+        error_ratio = trial.after.nis_mean / trial.before.nis_mean
+    return (
+        f"Set {remedy.format_settings(trial.change)}." if error_ratio < 1.0 else CORRECT_AT_SENDER
+    )

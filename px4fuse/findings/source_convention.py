@@ -24,12 +24,12 @@ from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings that do not depend on the positions
+# Groups of findings that do not depend on the position source
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
 # Id of the finding, kind of fault, message and action
-Fault = tuple[str, str, str, str]
+ConventionFault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
@@ -52,13 +52,13 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     """Remove the findings that are only effects of a wrong convention, except those about EKF2."""
     faults = _faults(analysis)
     root_findings = [item for item in findings if CONVENTION in item.evidence]
-    unusable = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
-    if unusable:
-        root_findings = unusable
+    unusable_findings = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
+    if unusable_findings:
+        root_findings = unusable_findings
         findings = [
             item
             for item in findings
-            if item in unusable
+            if item in unusable_findings
             or _is_effect(item)
             or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
         ]
@@ -71,26 +71,26 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     ]
     if not root_findings:
         return [*findings]
-    others = [
+    other_findings = [
         item
         for item in findings
         if item not in root_findings and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
     ]
-    if faults.is_ambiguous and not unusable:
+    if faults.is_ambiguous and not unusable_findings:
         return [
             *root_findings,
-            *(item for item in others if _is_effect(item) or item.severity == "note"),
+            *(item for item in other_findings if _is_effect(item) or item.severity == "note"),
         ]
     effects = [
         replace(item, message=f"{item.title}.", caused_by=root_findings[0].id)
-        for item in others
+        for item in other_findings
         if _is_effect(item) and item.caused_by is None
     ]
     return [
         root_findings[0],
         *effects,
         *root_findings[1:],
-        *(item for item in others if not _is_effect(item)),
+        *(item for item in other_findings if not _is_effect(item)),
     ]
 
 
@@ -104,7 +104,7 @@ def _faults(analysis: Comparison) -> Faults:
 
 def _position_faults(
     convention: Convention, faults: Faults, source: PositionTrack
-) -> Iterator[Fault]:
+) -> Iterator[ConventionFault]:
     positions, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
@@ -117,10 +117,12 @@ def _position_faults(
     is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
     if faults.has_wrong_axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
         orientation = convention.orientation
-        limit = "The analysis uses the positions converted to NED."
+        usage_text = "The analysis uses the positions converted to NED."
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
-            limit = "EKF2's heading came from this source, so the direction of north is unknown."
+            usage_text = (
+                "EKF2's heading came from this source, so the direction of north is unknown."
+            )
         fault, action = describe_axes(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
         )
@@ -128,15 +130,15 @@ def _position_faults(
             fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
-        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {limit}", action
+        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {usage_text}", action
     elif turn_deg:
-        heading = (
+        heading_text = (
             "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
         )
         message = (
             f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading}. The x axis of the source is not north, or this heading is "
-            f"wrong. {basis_text} The analysis uses the positions rotated to NED."
+            f"relative to {heading_text}. The x axis of the source is not north, or this heading "
+            f"is wrong. {basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -147,18 +149,19 @@ def _position_faults(
         yield "source_frame_misaligned", "rotation", message, action
     if faults.has_wrong_unit:
         fault, action = describe_unit(convention.unit, positions, is_file=is_file)
-        factor = convention.scale / UNITS[convention.unit]
+        distance_ratio = convention.scale / UNITS[convention.unit]
         message = (
-            f"{fault}. Distances are {factor:.3g} times those that the IMU measures. {basis_text} "
-            "The analysis uses the positions in metres."
+            f"{fault}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
+            f"{basis_text} The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
-    late_s, percent = convention.late_s, 100.0 * faults.clock_drift
-    if percent:
+    late_s, drift_percent = convention.late_s, 100.0 * faults.clock_drift
+    if drift_percent:
         message = (
-            f"The clock of the position timestamps is {abs(percent):.1f} % "
-            f"{'fast' if percent > 0 else 'slow'}, and the timestamps are {late_s:+.2f} s late in "
-            f"the middle of the flight. {basis_text} The analysis uses corrected timestamps."
+            f"The clock of the position timestamps is {abs(drift_percent):.1f} % "
+            f"{'fast' if drift_percent > 0 else 'slow'}, and the timestamps are {late_s:+.2f} s "
+            f"late in the middle of the flight. {basis_text} The analysis uses corrected "
+            "timestamps."
         )
         action = (
             "Take timestamps from a clock. Timestamps computed as frame number ÷ nominal rate "
@@ -190,7 +193,7 @@ def _position_faults(
 
 def _orientation_faults(
     orientation: OrientationConvention | None, faults: Faults, source: str
-) -> Iterator[Fault]:
+) -> Iterator[ConventionFault]:
     if orientation is None or not faults.orientation:
         return
     if faults.orientation == "copied":
@@ -204,20 +207,20 @@ def _orientation_faults(
         )
         yield "source_orientation_copied", "copied", message, action
         return
-    agreement = (
-        "roll and pitch of the orientation agree with the vehicle (median difference "
+    agreement_text = (
+        "the roll and pitch of the source agree with the autopilot (median difference "
         f"{orientation.tilt_difference_deg:.1f}°)"
     )
     fault, action = {
         "order": (
             f"The quaternion of {source} is sent in the order x, y, z, w; PX4 reads w, x, y, z. In "
-            f"the order x, y, z, w {agreement}",
+            f"the order x, y, z, w {agreement_text}",
             "Write w first (px4_msgs: q[0] is w). Eigen coeffs(), SciPy as_quat() and "
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
             f"The orientation of {source} is {orientation.frames}; PX4 reads FRD to NED. As "
-            f"{orientation.frames}, {agreement}",
+            f"{orientation.frames}, {agreement_text}",
             describe_conversion(orientation.frames),
         ),
         "heading": (

@@ -10,7 +10,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
-from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
+from px4fuse.findings.model import Findings, finding, fraction_of_ones, note, warning
 from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_phrase, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
@@ -20,16 +20,16 @@ from px4fuse.trajectory.rotation import interpolate
 MIN_HEADING_SIGMAS = 4.0
 # Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
-# Minimum yaw misalignment (°) for severity error: a quarter of the motion is on the wrong axis
-LARGE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions; if
-# the ratio is smaller, the heading of the positions drifts
-MIN_TRUE_DRIFT_FRACTION = 0.5
+# Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
+MIN_SEVERE_HEADING_ERROR_DEG = 15.0
+# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions;
+# below, the positions drift, not EKF2
+MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
-IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
-CALIBRATE = "Calibrate the magnetometer away from metal and motors."
+ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
+CALIBRATE_MAGNETOMETER = "Calibrate the magnetometer away from metal and motors."
 # Bit of EKF2_EV_CTRL that fuses the yaw of the source
-YAW_CONTROL = 8
+YAW_CONTROL_BIT = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
@@ -45,29 +45,29 @@ def detect(analysis: Analysis) -> Findings:
 def make_frame_finding(analysis: Analysis) -> Finding:
     """Make the finding of positions in FRD, whose x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
-    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
-    name = source_name(analysis.source)
+    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
+    sensor = source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis is the "
         "heading at start, not north."
     )
-    detail, action = "", f"In this report, north is the x axis of {name}."
-    if isinstance(fusing, Unavailable):
-        detail = f"The log does not show whether EKF2 fused the yaw of {name}."
+    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor}."
+    if isinstance(fusion_flags, Unavailable):
+        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor}."
         if log.has_ulog:
             action += " Give the ULog, too: it shows the frame that EKF2 uses."
     elif (
-        fusing is not None
-        and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
+        fusion_flags is not None
+        and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
-        detail = f"EKF2 fused the yaw of {name}, so EKF2 uses the same frame."
+        fusion_sentence = f"EKF2 fused the yaw of {sensor}, so EKF2 uses the same frame."
     has_yaw = analysis.source.orientation is not None
-    if detail:
-        return note("source_frame_frd", f"{fault} {detail}", action)
+    if fusion_sentence:
+        return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
     return warning(
         "source_frame_frd",
-        f"{fault} EKF2 did not fuse the yaw of {name}. The IMU is rotated into NED, so the axes of "
-        "positions and IMU may differ.",
+        f"{fault} EKF2 did not fuse the yaw of {sensor}. The IMU is rotated into NED, so the axes "
+        "of positions and IMU may differ.",
         "Send the position in NED"
         + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
     )
@@ -81,19 +81,21 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
             yield _drift_finding(analysis, heading)
         return
     fit = analysis.systematic_errors
-    is_bias = (
+    is_explained_by_bias = (
         not isinstance(fit, Unavailable)
         and analysis.source.orientation is None
         and abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
     )
-    if is_bias or abs(rotation_deg) < max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG):
+    if is_explained_by_bias or abs(rotation_deg) < max(
+        MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
+    ):
         return
     positions = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
         _, action = _gnss_heading_fault(analysis)
-    elif analysis.source.name == IN_EKF2_FRAME:
+    elif analysis.source.name == ALIGNED_TOPIC:
         reason = "EKF2 fused the positions in this frame. The IMU measures another direction."
         action = "Align the positioning frame with north."
     else:
@@ -104,10 +106,10 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if not analysis.source.origin.is_gnss and (calibrate := _calibrate(analysis)):
-        action += f" Or: {calibrate}"
+    if not analysis.source.origin.is_gnss and (calibration_advice := _calibration_advice(analysis)):
+        action += f" Or: {calibration_advice}"
     yield finding(
-        "error" if abs(rotation_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
+        "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
         f"{positions} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
         f"interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and constant "
@@ -123,12 +125,12 @@ def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
         cause = f"the wrong {aid_of(analysis).noise}, which weights GNSS against the magnetometer"
         return cause, f"Set {format_settings(trial.change)}, then check the heading again."
     cause = "a magnetometer near currents or steel"
-    return cause, f"{_calibrate(analysis)} {CHECK_GNSS_DELAY}".lstrip()
+    return cause, f"{_calibration_advice(analysis)} {CHECK_GNSS_DELAY}".lstrip()
 
 
-def _calibrate(analysis: Analysis) -> str:
+def _calibration_advice(analysis: Analysis) -> str:
     mag_type = analysis.flight.log.parameters.get(MAG.switch)
-    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE
+    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE_MAGNETOMETER
 
 
 def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
@@ -149,46 +151,49 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
         errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
     change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
-    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_FRACTION * change_deg
+    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_RATIO * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
-    first, last = heading.ends
-    angles = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
-    change = last.heading_error_deg - first.heading_error_deg
-    basis = "positions and IMU"
+    first_part, last_part = heading.ends
+    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
+    change_deg = last_part.heading_error_deg - first_part.heading_error_deg
+    estimation_basis = "positions and IMU"
     if heading.by == "orientation":
-        basis = f"the orientation of {source_name(analysis.source)}"
-    calibrate, has_yaw = _calibrate(analysis), analysis.source.orientation is not None
-    causes = [
-        "a magnetometer indoors" if calibrate else "a gyroscope bias",
+        estimation_basis = f"the orientation of {source_name(analysis.source)}"
+    calibration_advice, has_yaw = (
+        _calibration_advice(analysis),
+        analysis.source.orientation is not None,
+    )
+    possible_causes = [
+        "a magnetometer indoors" if calibration_advice else "a gyroscope bias",
         *(["odometry whose heading drifts"] if has_yaw else []),
     ]
-    possible_cause, action = ", or ".join(causes), ""
-    is_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL
-    let = "Or let" if calibrate else "Let"
-    if has_yaw and not is_fused:
-        action = f"{let} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+    possible_cause, action = ", or ".join(possible_causes), ""
+    is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL_BIT
+    let_text = "Or let" if calibration_advice else "Let"
+    if has_yaw and not is_yaw_fused:
+        action = f"{let_text} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
-        calibrate = ""
+        calibration_advice = ""
         possible_cause, action = _gnss_heading_fault(analysis)
     elif action and not analysis.flight.log.has_ulog:
-        action = f"{let} the autopilot fuse the yaw of the source."
+        action = f"{let_text} the autopilot fuse the yaw of the source."
     return finding(
-        "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
+        "error" if abs(change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
-        f"EKF2's heading drifts by {change:+.0f}° relative to the "
-        f"{positions_phrase(analysis.source)}. Its error is {angles[0]:+.0f}° from "
-        f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
-        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
-        f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "
-        f"{possible_cause}.",
-        f"{calibrate} {action}".strip() or "Check the heading source of EKF2.",
+        f"EKF2's heading drifts by {change_deg:+.0f}° relative to the "
+        f"{positions_phrase(analysis.source)}. Its error is {errors_deg[0]:+.0f}° from "
+        f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {errors_deg[1]:+.0f}° from "
+        f"{last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated from "
+        f"{estimation_basis}). A constant rotation of the positions cannot correct this. Possible "
+        f"cause: {possible_cause}.",
+        f"{calibration_advice} {action}".strip() or "Check the heading source of EKF2.",
         {
-            "from_deg": first.heading_error_deg,
-            "to_deg": last.heading_error_deg,
-            "from_s": first.start_s,
-            "to_s": last.end_s,
+            "from_deg": first_part.heading_error_deg,
+            "to_deg": last_part.heading_error_deg,
+            "from_s": first_part.start_s,
+            "to_s": last_part.end_s,
             "p": max(heading.drift_p, 1e-300),
         },
     )

@@ -16,13 +16,13 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Findings, error, format_percent, note, source_words, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
-from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
+from px4fuse.findings.source_positions import MIN_LAG_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# Ratio of white to time-correlated noise above which white noise is a separate fault
-MIN_WHITE_FRACTION = 0.3
-# Minimum gain of the log likelihood by time-correlated noise: 1 of 400 flights without a fault
-# exceeds it
+# Minimum ratio of white to time-correlated noise if the white noise is a separate fault
+MIN_WHITE_NOISE_RATIO = 0.3
+# Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
+# a fault exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
 # Minimum fraction of repeated positions for a warning
 MIN_REPEAT_FRACTION = 0.05
@@ -31,13 +31,13 @@ MIN_REPEAT_FRACTION_ERROR = 0.3
 # Minimum number of repeated positions for a finding
 MIN_REPEATS = 10
 # Minimum ratio of the position noises (σ) along north and east for a finding
-MIN_AXIS_RATIO = 1.5
-# Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
-MIN_PART_RATIO = 2.0
-# Minimum ratio of the noises without outliers, for a warning
-MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the noises for severity error
-MIN_PART_RATIO_ERROR = 4.0
+MIN_AXIS_NOISE_RATIO = 1.5
+# Minimum ratio of the position noises in one part of the flight and in the rest, for a warning
+MIN_PART_NOISE_RATIO = 2.0
+# Minimum ratio of the noises in one part of the flight and in the rest, without outliers
+MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
+# Minimum ratio of the noises in one part of the flight and in the rest, for severity error
+MIN_PART_NOISE_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -58,30 +58,36 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
         return
-    low, high = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
-    correlation_time, interval = f"{format_number(noise.tau_s, 1)} s", f"95 % {low} to {high} s"
+    low_text, high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
+    correlation_time_text, interval_text = (
+        f"{format_number(noise.tau_s, 1)} s",
+        f"95 % {low_text} to {high_text} s",
+    )
     if not np.isfinite(noise.high_s):
-        correlation_time, interval = f"at least {low} s", "95 %"
+        correlation_time_text, interval_text = f"at least {low_text} s", "95 %"
     is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    ratio = noise.white_m / float(np.nanmin(assumed_m))
-    if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_FRACTION * noise.slow_m:
-        evidence[WHITE_RATIO] = ratio
+    white_noise_ratio = noise.white_m / float(np.nanmin(assumed_m))
+    if (
+        white_noise_ratio > NOISE_RATIO_TOLERANCE
+        and noise.white_m > MIN_WHITE_NOISE_RATIO * noise.slow_m
+    ):
+        evidence[WHITE_RATIO] = white_noise_ratio
     # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
-    make_finding = note if is_gnss and not _exceeds_sigma(analysis) else warning
+    make_finding = note if is_gnss and not _exceeds_reported_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
-        f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
-        "KF and EKF2 assume independent errors: they follow the correlated error and report a σ "
-        "that is too small. Innovations do not show this error.",
+        f"{correlation_time_text} ({interval_text}). It adds to white noise of {noise.white_m:.2g} "
+        "m (1 σ). KF and EKF2 assume independent errors: they follow the correlated error and "
+        "report a σ that is too small. Innovations do not show this error.",
         f"Check {source_words(analysis.source).errors}.",
         evidence,
     )
 
 
-def _exceeds_sigma(analysis: Analysis) -> bool:
+def _exceeds_reported_sigma(analysis: Analysis) -> bool:
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)
@@ -94,7 +100,7 @@ def _exceeds_sigma(analysis: Analysis) -> bool:
 
 def detect_repeated_positions(analysis: Analysis) -> Findings:
     """Detect positions that are equal to the previous one while the vehicle moves."""
-    if hardly_moved(analysis):
+    if has_little_motion(analysis):
         return
     positions_m = (
         cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
@@ -102,20 +108,20 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         .to_numpy()
     )
     is_repeated = np.all(np.diff(positions_m, axis=0) == 0.0, axis=1)
-    count, repeated_fraction = (
+    repeated_count, repeated_fraction = (
         int(is_repeated.sum()),
         float(is_repeated.mean()) if len(is_repeated) else 0.0,
     )
-    if count < MIN_REPEATS or repeated_fraction < MIN_REPEAT_FRACTION:
+    if repeated_count < MIN_REPEATS or repeated_fraction < MIN_REPEAT_FRACTION:
         return
     make_finding = error if repeated_fraction >= MIN_REPEAT_FRACTION_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the previous "
-        f"position ({format_percent(repeated_fraction)}). KF and EKF2 use each repetition as a new "
-        "measurement.",
+        f"{repeated_count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the "
+        f"previous position ({format_percent(repeated_fraction)}). KF and EKF2 use each repetition "
+        "as a new measurement.",
         "Send each position once, with its time of measurement.",
-        {"count": count, "share": repeated_fraction},
+        {"count": repeated_count, "share": repeated_fraction},
     )
 
 
@@ -131,7 +137,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     if len(noises_m) < 2:
         return
     (smaller_m, _, smaller_high_m, quiet_axis), (larger_m, larger_low_m, _, noisy_axis) = noises_m
-    if larger_m < MIN_AXIS_RATIO * smaller_m or larger_low_m <= smaller_high_m:
+    if larger_m < MIN_AXIS_NOISE_RATIO * smaller_m or larger_low_m <= smaller_high_m:
         return
     yield warning(
         "source_noise_unequal_axes",
@@ -148,19 +154,19 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     noisy_part = analysis.noisy_part
     if (
         noisy_part is None
-        or noisy_part.ratio < MIN_PART_RATIO
+        or noisy_part.ratio < MIN_PART_NOISE_RATIO
         # a fused outlier increases later innovations
-        or noisy_part.ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS
+        or noisy_part.ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return
-    ratio, start, end = noisy_part.ratio, noisy_part.start_s, noisy_part.end_s
-    yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
+    noise_ratio, start_s, end_s = noisy_part.ratio, noisy_part.start_s, noisy_part.end_s
+    yield (error if noise_ratio >= MIN_PART_NOISE_RATIO_ERROR else warning)(
         "source_noise_varies",
-        f"{source_name(analysis.source)} noise is {ratio:.1f} times larger from "
-        f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
-        "No single SIGMA_Z fits the whole flight.",
+        f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
+        f"{start_s:.0f} to {end_s:.0f} s. Most samples of that time are affected, not single "
+        "outliers. No single SIGMA_Z fits the whole flight.",
         f"Check {source_words(analysis.source).reception} in that time. Let the source send a "
         "variance with each position, or analyse this time separately (--start, --end).",
-        {"ratio": ratio, "first_s": start, "until_s": end},
-        ((start, end),),
+        {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
+        ((start_s, end_s),),
     )

@@ -43,14 +43,16 @@ from px4fuse.flight.model import (
 
 # Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
 MIN_MOTION_RANGE_M = 0.5
-# The 5th to 95th percentile of white noise spans 3.29 σ; the margin is 25 %
-NOISE_RANGE_FACTOR = 1.25 * 3.29
-# Minimum gain of the log likelihood by a low pass over white noise: 0 to 2 without a low pass
+# Minimum extent (σ of the noise) of the positions of a vehicle that moves: white noise extends
+# over 3.29 σ (5th to 95th percentile), and the margin is 25 %
+MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
+# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; without a low pass the
+# ratio is 0 to 2
 MIN_LOW_PASS_GAIN_NATS = 6.0
-# Minimum gain of the log likelihood by a low pass over time-correlated noise without lag
+# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise
 MIN_LAG_NATS = 1.0
-# A fitted lag above this multiple of the largest delay in the 95 % interval is replaced by the
-# delay
+# Maximum ratio of the lag of a low pass to the largest delay in the 95 % interval; a larger lag
+# is replaced by the delay
 MAX_LAG_RATIO = 4.0
 # Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -58,46 +60,47 @@ MIN_LAG_S = 0.05
 MIN_LAG_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum jump in σ of the time-correlated noise
+# Minimum position jump (σ of the time-correlated noise) for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps of a source that jumps repeatedly, with a change of reset_counter
 MIN_ANNOUNCED_JUMPS = 2
 # Minimum number of jumps of a source that jumps repeatedly, without a change of reset_counter
 MIN_UNANNOUNCED_JUMPS = 3
-# Minimum size (m) of one of many jumps without a change of reset_counter
-MIN_SMALL_JUMP_M = 0.1
-# Minimum ratio of a jump without a change of reset_counter to the median change between steps
-MIN_STEP_RATIO = 8.0
-# Number of position changes in this median
-NOISE_SAMPLES = 61
+# Minimum size (m) of each of several jumps without a change of reset_counter
+MIN_UNANNOUNCED_JUMP_M = 0.1
+# Minimum ratio of a jump without a change of reset_counter to the median change of nearby steps
+MIN_UNANNOUNCED_JUMP_RATIO = 8.0
+# Number of position changes in the median with which a jump is compared
+MEDIAN_CHANGE_COUNT = 61
 # Minimum number of positions for the detection of jumps
-MIN_JUMP_ROWS = 100
-# Minimum time (s) and minimum number of positions for which a jump lasts: outliers are shorter
+MIN_POSITIONS_FOR_JUMPS = 100
+# Minimum duration (s), and minimum number of positions, of the shift by a jump: outliers are
+# shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# Maximum difference between the jump and the shift of the median position, as fraction of the jump
+# Maximum ratio of the difference between the jump and the shift of the median position to the jump
 MAX_LASTING_RATIO = 0.5
-# Maximum interval at a jump in median intervals: during a gap the vehicle moves
-MAX_INTERVAL_RATIO = 1.5
-# Minimum fraction of jumps opposite to the previous one, for positions that alternate
-MIN_RETURNS = 0.7
-# Maximum time (s) from a jump to the reset of EKF2 that it causes
-MAX_WAIT_S = 5.0
+# Maximum interval (median intervals) before a jump: in a longer gap the vehicle moves
+MAX_JUMP_INTERVAL_RATIO = 1.5
+# Minimum fraction of jumps opposite to the previous jump, if the positions alternate
+MIN_RETURN_FRACTION = 0.7
+# Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
+MAX_JUMP_TO_RESET_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
-# Times within this tolerance (s) are equal: timestamps have a resolution of 1 µs
+# Maximum difference (s) between the time of a position and the time of its reset_counter
 RESET_TOLERANCE_S = 1e-4
 # Bits of EKF2_EV_CTRL: horizontal position, and height
 HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
-MAX_RESET_DISTANCE_S = 1.0
+MAX_JUMP_TO_COUNTER_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
 MIN_JUMP_ERROR_M = 0.5
 # Minimum scale error (ratio minus 1) for a warning: simulated flights without a fault reach 0.11
-MIN_SCALE = 0.12
-# Minimum scale error (ratio minus 1) for severity error: 1 m in 7 m
-MIN_SCALE_ERROR = 0.15
-# Minimum scale error in σ of its estimate: 0.3 % of correct sources exceed it
-MIN_SCALE_SIGMAS = 3.0
+MIN_SCALE_ERROR_WARNING = 0.12
+# Minimum scale error (ratio minus 1) for severity error: 1 m in a distance of 7 m
+MIN_SCALE_ERROR_SEVERE = 0.15
+# Minimum scale error (σ of its estimate) for a warning: 0.3 % of correct sources exceed it
+MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
@@ -138,15 +141,15 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    clock, correlation = analysis.clock, analysis.time_correlated_noise
+    clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
     # at a high rate, the time offset determines the lag better than the correlation does
     limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
     if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # a low pass delays positions: correlated errors without a lag have another cause
     if (
-        isinstance(correlation, TimeCorrelatedNoise)
-        and correlation.low_pass_gain_nats < MIN_LAG_NATS
+        isinstance(correlated_noise, TimeCorrelatedNoise)
+        and correlated_noise.low_pass_gain_nats < MIN_LAG_NATS
     ):
         return None
     return low_pass
@@ -183,32 +186,38 @@ def detect_jumps(analysis: Analysis) -> Findings:
         # time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large_jumps = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
-    reset_s = reset_times_s(analysis.source)
+    counter_changes_s = reset_times_s(analysis.source)
     if large_jumps:
-        largest = max(large_jumps, key=lambda jump: jump.size_m)
-        size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
+        largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
+        size_m, jump_s, sigma_m = (
+            largest_jump.size_m,
+            largest_jump.time_s,
+            max(step.sigma for step in largest_jump.step_m),
+        )
         positions = positions_phrase(analysis.source)
         words = source_words(analysis.source)
         cause = f"Possible causes: {words.jump}."
-        evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
-        if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
-            evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
+        evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": jump_s, "sigma_m": sigma_m}
+        if np.any(np.abs(counter_changes_s - jump_s) < MAX_JUMP_TO_COUNTER_S):
+            evidence[ANNOUNCED] = float(
+                counter_changes_s[np.argmin(np.abs(counter_changes_s - jump_s))]
+            )
             cause = (
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
             )
         jump_text = f"jump by {size_m:.2f} m"
         steps_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
-        end = "stay there"
+        end_text = "stay there"
         if np.linalg.norm(steps_m.sum(axis=0)) < MIN_JUMP_M:
-            end = "return afterwards"
+            end_text = "return afterwards"
         if len(large_jumps) > 1:
             jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} {jump_text} at {at_s:.1f} s and {end}. The IMU measures no such motion "
-            f"(± {1.96 * sigma:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and their "
-            "innovations stay consistent.",
+            f"{positions} {jump_text} at {jump_s:.1f} s and {end_text}. The IMU measures no such "
+            f"motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and "
+            "their innovations stay consistent.",
             f"{words.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large_jumps),
@@ -241,40 +250,47 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     jumps, is_announced = _find_jumps(analysis)
     if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
         return
-    times_s, steps_m = np.array([time_s for time_s, _ in jumps]), np.array([s for _, s in jumps])
+    times_s, steps_m = (
+        np.array([time_s for time_s, _ in jumps]),
+        np.array([step_m for _, step_m in jumps]),
+    )
     sizes_m = np.linalg.norm(steps_m, axis=1)
     resets_s = [
         reset.time_s
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
         if reset.quantity == "position" and any(reset.delta[:2])
     ]
-    waits_s = [
-        min(later)
+    jump_to_reset_s = [
+        min(waits_after_jump_s)
         for jump_s in times_s
-        if (later := [at_s - jump_s for at_s in resets_s if 0.0 < at_s - jump_s < MAX_WAIT_S])
-    ]
-    effect = ""
-    if waits_s:
-        effect = (
-            " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(waits_s):.1f} s later."
+        if (
+            waits_after_jump_s := [
+                at_s - jump_s for at_s in resets_s if 0.0 < at_s - jump_s < MAX_JUMP_TO_RESET_S
+            ]
         )
-    listed = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
-    returns = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
-    counter = "and its reset_counter rises at each jump"
+    ]
+    reset_sentence = ""
+    if jump_to_reset_s:
+        reset_sentence = (
+            " EKF2 rejects the positions after a jump and resets its position "
+            f"{np.median(jump_to_reset_s):.1f} s later."
+        )
+    listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
+    is_return = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    counter_text = "and its reset_counter rises at each jump"
     cause = "the source (VIO or SLAM) drifts and corrects its drift"
     if not is_announced:
-        counter = "without a change of reset_counter"
+        counter_text = "without a change of reset_counter"
         cause = f"possible causes are {source_words(analysis.source).jump}"
     action = "Improve the tracking of the source, or correct the drift in smaller steps."
-    if returns.mean() >= MIN_RETURNS:
+    if is_return.mean() >= MIN_RETURN_FRACTION:
         cause = f"the source measures two points in turn, {np.median(sizes_m):.2f} m apart"
-        action = "Send the position of one point of the vehicle."
+        action = "Send the position of the same point of the vehicle, for example of one tag."
     yield error(
         "source_relocalises",
-        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter}. The "
-        f"jumps are at {listed} s, about every {np.median(np.diff(times_s)):.0f} s: {cause}."
-        f"{effect}",
+        f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter_text}. The "
+        f"jumps are at {listed_times} s, about every {np.median(np.diff(times_s)):.0f} s: {cause}."
+        f"{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
         zero_length_spans(times_s.tolist()),
@@ -290,29 +306,40 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
         Columns.POSITION[:2]
     ].dropna()
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
-    if len(steps_m) < MIN_JUMP_ROWS:
+    if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
-    excess_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
-    size_m, interval_s = np.linalg.norm(excess_m, axis=1), np.diff(time_s)[1:-1]
-    resets = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
-    resets = resets[(resets >= 0) & (resets < len(size_m))]
-    resets = resets[size_m[resets] >= MIN_JUMP_M]
-    if len(resets) >= MIN_ANNOUNCED_JUMPS:
-        return [(float(time_s[row + 2]), excess_m[row]) for row in resets], True
-    usual_m = pd.Series(size_m).rolling(NOISE_SAMPLES, center=True, min_periods=1).median()
-    limit_m = np.maximum(MIN_SMALL_JUMP_M, MIN_STEP_RATIO * usual_m.to_numpy())
-    is_jump = (size_m > limit_m) & (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s))
-    count = max(MIN_LASTING_SAMPLES, round(MIN_LASTING_S / float(np.median(interval_s))))
+    excess_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
+    excess_sizes_m, intervals_s = np.linalg.norm(excess_steps_m, axis=1), np.diff(time_s)[1:-1]
+    counter_rows = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
+    counter_rows = counter_rows[(counter_rows >= 0) & (counter_rows < len(excess_sizes_m))]
+    counter_rows = counter_rows[excess_sizes_m[counter_rows] >= MIN_JUMP_M]
+    if len(counter_rows) >= MIN_ANNOUNCED_JUMPS:
+        return [(float(time_s[row + 2]), excess_steps_m[row]) for row in counter_rows], True
+    median_change_m = (
+        pd.Series(excess_sizes_m).rolling(MEDIAN_CHANGE_COUNT, center=True, min_periods=1).median()
+    )
+    limit_m = np.maximum(
+        MIN_UNANNOUNCED_JUMP_M, MIN_UNANNOUNCED_JUMP_RATIO * median_change_m.to_numpy()
+    )
+    is_jump = (excess_sizes_m > limit_m) & (
+        intervals_s < MAX_JUMP_INTERVAL_RATIO * np.median(intervals_s)
+    )
+    lasting_count = max(MIN_LASTING_SAMPLES, round(MIN_LASTING_S / float(np.median(intervals_s))))
     jumps = []
     for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
         before_m, after_m = (
-            position_m.iloc[max(row - count, 0) : row],
-            position_m.iloc[row:][:count],
+            position_m.iloc[max(row - lasting_count, 0) : row],
+            position_m.iloc[row:][:lasting_count],
         )
-        around_m = steps_m[max(row - count, 0) : row + count]
-        lasting_m = after_m.median() - before_m.median() - count * np.median(around_m, axis=0)
-        if np.linalg.norm(lasting_m - excess_m[row - 2]) < MAX_LASTING_RATIO * size_m[row - 2]:
-            jumps.append((float(time_s[row]), excess_m[row - 2]))
+        steps_around_m = steps_m[max(row - lasting_count, 0) : row + lasting_count]
+        lasting_shift_m = (
+            after_m.median() - before_m.median() - lasting_count * np.median(steps_around_m, axis=0)
+        )
+        if (
+            np.linalg.norm(lasting_shift_m - excess_steps_m[row - 2])
+            < MAX_LASTING_RATIO * excess_sizes_m[row - 2]
+        ):
+            jumps.append((float(time_s[row]), excess_steps_m[row - 2]))
     return jumps, False
 
 
@@ -330,18 +357,18 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         or not _is_clock_known(analysis)
     ):
         return
-    excess, sigma = fit.scale.value, fit.scale.sigma
-    if abs(excess) >= max(MIN_SCALE, MIN_SCALE_SIGMAS * sigma):
+    scale_error, sigma = fit.scale.value, fit.scale.sigma
+    if abs(scale_error) >= max(MIN_SCALE_ERROR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
         yield finding(
-            "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
+            "error" if abs(scale_error) >= MIN_SCALE_ERROR_SEVERE else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are "
-            f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. The "
+            f"{format_percent(abs(scale_error))} too {'long' if scale_error > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
             "Measure a known distance with the source. Then check "
             f"{source_words(analysis.source).scale}.",
-            {"scale": 1.0 + excess, "sigma": sigma},
+            {"scale": 1.0 + scale_error, "sigma": sigma},
         )
 
 
@@ -352,7 +379,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
         return
     fit = analysis.systematic_errors
     jump_times_s = [jump.time_s for jump in fit.jumps] if isinstance(fit, SystematicErrors) else []
-    times_s = [
+    outlier_times_s = [
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
         if not any(
@@ -360,28 +387,28 @@ def detect_outliers(analysis: Analysis) -> Findings:
             for jump_s in jump_times_s
         )
     ]
-    count, outlier_fraction = len(times_s), len(times_s) / axis_tuning.count
-    if outlier_fraction < MIN_OUTLIER_FRACTION or count < MIN_OUTLIERS:
+    outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
+    if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
     words = source_words(analysis.source)
-    sizes_m, reference = outlier_sizes_m(analysis, np.array(times_s))
+    sizes_m, reference = outlier_sizes_m(analysis, np.array(outlier_times_s))
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
         "source_outliers",
-        f"{count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
+        f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(sizes_m)))} m. "
-        f"Possible cause: {words.outliers}. KF has no gate and follows each "
-        f"outlier.{_rejected(analysis, times_s)}",
+        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {words.outliers}. KF has "
+        "no gate and follows each "
+        f"outlier.{_rejected_outliers_sentence(analysis, outlier_times_s)}",
         words.outliers_action,
         {
-            "count": count,
+            "count": outlier_count,
             "share": outlier_fraction,
-            "first_s": times_s[0],
+            "first_s": outlier_times_s[0],
             "max_m": float(sizes_m.max()),
         },
-        zero_length_spans(times_s),
+        zero_length_spans(outlier_times_s),
     )
 
 
@@ -402,7 +429,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
     return np.sqrt(squares_m2), "ground truth" if has_truth else "the neighbouring positions"
 
 
-def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
+def _rejected_outliers_sentence(analysis: Analysis, outlier_times_s: Sequence[float]) -> str:
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
@@ -410,8 +437,10 @@ def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
         return ""
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.rate_hz
-    count = sum(bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in times_s)
-    return f" EKF2's gate rejected {count} of the {len(times_s)} outliers."
+    rejected_count = sum(
+        bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in outlier_times_s
+    )
+    return f" EKF2's gate rejected {rejected_count} of the {len(outlier_times_s)} outliers."
 
 
 def detect_wrong_variance(analysis: Analysis) -> Findings:
@@ -422,24 +451,24 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     )
     if may_be_low_passed or not isinstance(axis_tuning, AxisTuning) or not source.origin.is_vision:
         return
-    reported = cut_to_segment(source.samples, analysis.segment)[
+    reported_variance_m2 = cut_to_segment(source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[:2]
     ].dropna()
     noise = axis_tuning.sigma_z
     noise_m, low, high = noise.value, noise.low, noise.high
-    if reported.empty or noise_m is None or low is None or high is None:
+    if reported_variance_m2.empty or noise_m is None or low is None or high is None:
         return
-    reported_m = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
+    reported_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_m / noise_m) ** 2
     ratio = max(variance_ratio, 1.0 / variance_ratio)
     # R also has to include time-correlated errors, which innovations do not show
-    error_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
-    if error_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * error_m**2:
+    rmse_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
+    if rmse_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
         return
     if ratio >= MIN_VARIANCE_RATIO and not low <= reported_m <= high:
-        direction, reservation = "small" if variance_ratio < 1.0 else "large", ""
-        if direction == "large" and error_m is None:
-            reservation = " The reported σ may include time-correlated errors."
+        direction, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
+        if direction == "large" and rmse_m is None:
+            correlation_note = " The reported σ may include time-correlated errors."
         severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
         effect = "EKF2 uses this variance (EKF2_EV_NOISE_MD 0), but at least EKF2_EVP_NOISE²."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
@@ -449,7 +478,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
             f"{direction}. The reported σ is {reported_m:.3g} m, the position noise {noise_m:.3g} "
-            f"m (95 % {low:.3g} to {high:.3g} m). {effect}{reservation}",
+            f"m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,
@@ -460,14 +489,16 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
 
 
 def _rmse_per_axis_m(analysis: Analysis) -> float | None:
-    squares = []
+    mean_squares_m2 = []
     for result in north_and_east(analysis):
         if isinstance(result.truth, Unavailable):
             return None
-        true, axis = result.truth["position_m"].dropna(), result.axis
-        true_m = np.interp(axis.measurement_time_s, true.index, true, left=np.nan, right=np.nan)
-        squares.append(np.nanmean((axis.measurement_m - true_m) ** 2))
-    return float(np.sqrt(np.mean(squares))) if squares else None
+        true_positions, axis = result.truth["position_m"].dropna(), result.axis
+        true_m = np.interp(
+            axis.measurement_time_s, true_positions.index, true_positions, left=np.nan, right=np.nan
+        )
+        mean_squares_m2.append(np.nanmean((axis.measurement_m - true_m) ** 2))
+    return float(np.sqrt(np.mean(mean_squares_m2))) if mean_squares_m2 else None
 
 
 def motion_range_m(comparison: Comparison) -> float:
@@ -477,19 +508,19 @@ def motion_range_m(comparison: Comparison) -> float:
     return float(np.max(high - low))
 
 
-def hardly_moved(comparison: Comparison) -> bool:
+def has_little_motion(comparison: Comparison) -> bool:
     """Return True if the extent of the positions is small, or not larger than their noise."""
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
     noise_m = white_noise_m(positions.to_numpy())
-    return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)
+    return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m)
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
     """Detect too little motion to estimate velocity, heading and time offset."""
     extent_m = motion_range_m(analysis)
-    if hardly_moved(analysis):
+    if has_little_motion(analysis):
         yield warning(
             "no_motion",
             f"The vehicle moved only {extent_m:.2f} m horizontally. This is the range of the "

@@ -7,27 +7,27 @@ from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP_ACTION, STAMP_FAULTS, SYNCHRONISE_ACTION
-from px4fuse.findings.model import Findings, error, fraction_on, note, warning
+from px4fuse.findings.model import Findings, error, fraction_of_ones, note, warning
 from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
 from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_phrase
 
 # Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# Maximum age (s) of a position whose timestamp is its arrival time: PX4 publishes it within 1 ms
+# Maximum age (s), at publication by PX4, of a position whose timestamp is its arrival time
 MAX_ARRIVAL_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum number of positions before, and after, the time at which TIMESYNC converged
+# Minimum number of positions before, and also after, the convergence of TIMESYNC
 MIN_SAMPLES = 10
-# Minimum fraction of timestamps that are arrival times before TIMESYNC converged, and measurement
-# times after it
+# Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
+# measurement times after the convergence
 MIN_CONSISTENT_FRACTION = 0.95
-# Minimum mean number of positions in a burst
-MIN_BURST = 2.5
-# Maximum ratio of the interval within bursts to the pause between them
-MAX_BURST_RATIO = 0.1
+# Minimum mean number of positions in a burst of positions that arrive together
+MIN_BURST_SIZE = 2.5
+# Maximum ratio of the interval within bursts of positions to the pause between bursts
+MAX_BURST_INTERVAL_RATIO = 0.1
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -63,42 +63,48 @@ def _describe_bursts(analysis: Analysis) -> str:
     """Return a sentence on positions that arrive in bursts; empty if they arrive one by one."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
-    if not is_pause.any() or (count := 1.0 / float(is_pause.mean())) < MIN_BURST:
+    if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
         return ""
     pause_s = float(np.median(intervals_s[is_pause]))
-    if np.median(intervals_s[~is_pause]) > MAX_BURST_RATIO * pause_s:
+    if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
         return ""
-    return f" The positions arrive in bursts of {count:.0f}, every {pause_s:.2g} s."
+    return f" The positions arrive in bursts of {burst_size:.0f}, every {pause_s:.2g} s."
 
 
-def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:
+def detect_shared_timestamps(
+    analysis: Analysis, sample_count: int, distinct_count: int
+) -> Findings:
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
-    rate_hz = count / (distinct_count * resolution_s)
+    rate_hz = sample_count / (distinct_count * resolution_s)
     yield error(
         "source_timestamps_shared",
         f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
-        f"{resolution_s:.3g} s. {count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
+        f"{resolution_s:.3g} s. {sample_count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
         "timestamps. px4fuse uses the first sample of each timestamp. At 1 m/s a rounded "
         f"timestamp is a position error of up to {format_metres(resolution_s)} m.",
         "Send the time of measurement with a resolution of microseconds.",
-        {"resolution_s": resolution_s, "samples": count, "distinct": distinct_count},
+        {"resolution_s": resolution_s, "samples": sample_count, "distinct": distinct_count},
     )
 
 
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
-    fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    effect = ""
-    if isinstance(fusing, pd.DataFrame) and not fraction_on(fusing["horizontal"], segment):
-        effect = f"EKF2 never fused the positions: it reads them as {STAMP_FAULTS[clock]}. "
+    fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
+    fusion_sentence = ""
+    if isinstance(fusion_flags, pd.DataFrame) and not fraction_of_ones(
+        fusion_flags["horizontal"], segment
+    ):
+        fusion_sentence = (
+            f"EKF2 never fused the positions: it reads them as {STAMP_FAULTS[clock]}. "
+        )
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
-        f"in microseconds since the autopilot's boot. {effect}px4fuse uses the arrival times, "
-        "which are late by the latency.",
+        f"in microseconds since the autopilot's boot. {fusion_sentence}px4fuse uses the arrival "
+        "times, which are late by the latency.",
         SYNCHRONISE_ACTION if is_unix else SET_TIMESTAMP_ACTION,
         {"clock": clock},
     )
@@ -132,8 +138,8 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
     Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
     when PX4 publishes it is then zero instead of the latency.
     """
-    age = _age_s(analysis)
-    if age is None:
+    position_age_s = _position_age_s(analysis)
+    if position_age_s is None:
         return
     synchronisation = find_synchronisation(analysis)
     if synchronisation is not None:
@@ -151,41 +157,52 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             "Let the clocks synchronise for one minute before take-off. Analyse only the later "
             f"time (--start {until_s:.0f}).",
             {"until_s": until_s, "latency_s": latency_s},
-            ((float(age.index[0]), until_s),),
+            ((float(position_age_s.index[0]), until_s),),
         )
-    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_FRACTION:
+    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_FRACTION:
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
             "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
             ANSWER_TIMESYNC,
-            {"until_s": float(age.index[-1])},
+            {"until_s": float(position_age_s.index[-1])},
         )
 
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     """Find the time (s) at which TIMESYNC converged in flight, and the position latency (s)."""
-    age = _age_s(analysis)
-    if age is None:
+    position_age_s = _position_age_s(analysis)
+    if position_age_s is None:
         return None
-    is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
+    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
     # number of contradicting timestamps, if TIMESYNC converged after this position
-    wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
-    index = int(np.argmin(wrong_count)) + 1
-    if np.mean(is_arrival) >= MIN_CONSISTENT_FRACTION or min(index, len(age) - index) < MIN_SAMPLES:
+    contradicting_count: Array = (
+        np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
+    )
+    converged_index = int(np.argmin(contradicting_count)) + 1
+    if (
+        np.mean(is_arrival_time) >= MIN_CONSISTENT_FRACTION
+        or min(converged_index, len(position_age_s) - converged_index) < MIN_SAMPLES
+    ):
         return None
-    latency_s = float(age.iloc[index:].median())
-    consistent_fraction = min(np.mean(is_arrival[:index]), np.mean(~is_arrival[index:]))
+    latency_s = float(position_age_s.iloc[converged_index:].median())
+    consistent_fraction = min(
+        np.mean(is_arrival_time[:converged_index]), np.mean(~is_arrival_time[converged_index:])
+    )
     if consistent_fraction < MIN_CONSISTENT_FRACTION or latency_s < MIN_LATENCY_S:
         return None
-    return float(age.index[index]), latency_s
+    return float(position_age_s.index[converged_index]), latency_s
 
 
-def _age_s(analysis: Analysis) -> pd.Series | None:
+def _position_age_s(analysis: Analysis) -> pd.Series | None:
     """Return the age (s) of each position when PX4 publishes it, if logged."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
-    record = ekf2.record if isinstance(ekf2, Ekf2) else None
-    if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:
+    fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
+    if (
+        not isinstance(fusion_record, FusionRecord)
+        or source.origin.reconstructed
+        or source.clock_map
+    ):
         return None
-    age = record.vision_age_s.loc[segment.start_s : segment.end_s]
-    return age if len(age) >= 2 * MIN_SAMPLES else None
+    position_age_s = fusion_record.vision_age_s.loc[segment.start_s : segment.end_s]
+    return position_age_s if len(position_age_s) >= 2 * MIN_SAMPLES else None

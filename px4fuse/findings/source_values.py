@@ -17,32 +17,33 @@ from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, source_words, warning
-from px4fuse.findings.source_intervals import state_errors_after
+from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
-MIN_STEP_M = 0.05
+MIN_ROUNDING_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to that as flown
-MAX_ERROR_RATIO = 0.7
+MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
-MIN_OFFSET_M = 0.1
-# Minimum distance between the positions of two senders, in σ: white noise of one sender reaches 2
-MIN_OFFSET_SIGMAS = 4.0
+MIN_SENDER_DISTANCE_M = 0.1
+# Minimum distance (σ) between the positions of two senders: white noise of one sender reaches 2 σ
+MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Number of samples in a window for detecting two senders: short, because a lost sample swaps them
-WINDOW = 16
-# Minimum number of windows: with fewer windows, outliers of one sender resemble two senders
+WINDOW_SAMPLES = 16
+# Minimum number of windows for detecting two senders: in fewer windows, outliers of one sender
+# resemble a second sender
 MIN_WINDOWS = 10
-# Maximum median distance (m) from EKF2's position to a copy of it
-MAX_COPY_M = 0.01
-# Maximum median distance (m) from EKF2's position to a copy of it that EKF2 fuses
-MAX_FOLLOWED_COPY_M = 0.001
-# Minimum speed (m/s) for the comparison with EKF2: at rest any source may equal EKF2's position
+# Maximum median distance (m) between EKF2's position and a source that is its copy
+MAX_COPY_DISTANCE_M = 0.01
+# Maximum median distance (m) between EKF2's position and a source that is its copy and is fused
+MAX_FUSED_COPY_DISTANCE_M = 0.001
+# Minimum speed (m/s) for detecting a copy: at rest any source may equal EKF2's position
 MIN_COPY_SPEED_M_S = 0.2
-# Tested times (s) between EKF2's position and the timestamp of its copy
-DELAYS_S = np.arange(0.0, 0.305, 0.005)
+# Tested delays (s) of a source that is a copy of EKF2's position
+COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES = "px4fuse estimates nothing from these positions."
 # Id of the finding, fault and action for each kind of invalid position
-INVALID: Mapping[str, tuple[str, str, str]] = {
+INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
         "{positions} are exactly 0, 0, 0: the source sends zeros when it has no position",
@@ -76,8 +77,8 @@ def detect(analysis: Analysis) -> Findings:
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
     # rows of one span have the same valid sample before them
-    before = np.searchsorted(valid_s, time_s)
-    starts = np.flatnonzero(np.diff(before, prepend=-1))
+    valid_count_before = np.searchsorted(valid_s, time_s)
+    starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
     return tuple(zip(time_s[starts].tolist(), time_s[ends].tolist(), strict=True))
 
@@ -85,42 +86,51 @@ def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
 def detect_invalid_rows(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
-    for reason, (name, fault_template, action) in INVALID.items():
+    for reason, (name, fault_template, action) in INVALID_POSITION_TEXTS.items():
         time_s = invalid[invalid == reason].index.to_numpy()
         if not (count := len(time_s)):
             continue
         spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
-        longest_s = max(spans, key=lambda span: span[1] - span[0])
-        duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
+        longest_span_s = max(spans, key=lambda span: span[1] - span[0])
+        duration_s, total_s = (
+            longest_span_s[1] - longest_span_s[0],
+            sum(end - start for start, end in spans),
+        )
         fault = fault_template.format(positions=f"{count} {positions_phrase(source)}")
         times = f"{len(spans)} spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
-        effect, make_finding = "", note if reason == "NaN" else warning
+        error_text, make_finding = "", note if reason == "NaN" else warning
         if duration_s > max_interval_s(1.0 / source.rate_hz):
             make_finding = warning
-            effect = f" {state_errors_after(analysis, _valid_around(analysis, longest_s))}"
+            valid_times_s = _valid_times_around(analysis, longest_span_s)
+            error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
             name,
             f"{fault}. Times of these positions: {times} ({total_s:.1f} s in total). KF does not "
-            f"use them.{effect}",
-            action or f"Check {source_words(source).reception} at {longest_s[0]:.1f} s.",
-            {"count": count, "longest_s": duration_s, "total_s": total_s, "at_s": longest_s[0]},
+            f"use them.{error_text}",
+            action or f"Check {source_words(source).reception} at {longest_span_s[0]:.1f} s.",
+            {
+                "count": count,
+                "longest_s": duration_s,
+                "total_s": total_s,
+                "at_s": longest_span_s[0],
+            },
             spans,
         )
 
 
-def _valid_around(analysis: Analysis, span_s: Span) -> Span:
+def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
     """Return the times of the last valid measurement before a span and the first one after it."""
     time_s = analysis.lines[0].measurement_time_s
-    at = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
-    return float(time_s[at[0] - 1]), float(time_s[at[1]])
+    indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
+    return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
 
 
 def detect_rounding(analysis: Analysis) -> Findings:
     """Detect positions that are rounded to coarse steps."""
     source, step_m = analysis.source, analysis.source.step_m
-    if step_m < MIN_STEP_M:
+    if step_m < MIN_ROUNDING_STEP_M:
         return
     cause, action = "The source rounds the positions.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
@@ -145,19 +155,19 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     """Detect a sensor that is mounted away from the IMU without a lever arm in EKF2."""
     source, convention = analysis.source, analysis.convention
     has_truth = isinstance(analysis.flight.truth, Truth)
-    is_determined = convention is not None and convention.verdict == "determined"
-    if not source.origin.has_all_samples or not (has_truth or is_determined):
+    is_convention_determined = convention is not None and convention.verdict == "determined"
+    if not source.origin.has_all_samples or not (has_truth or is_convention_determined):
         return
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
     forward_m, right_m, sigma_m = lever_arm
-    values = (
+    lever_arm_m = (
         np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     )  # + 0.0 removes a sign of zero
-    change = dict(zip(aid_of(analysis).lever_arm, values.tolist(), strict=False))
-    effect = _replayed_effect(analysis, change)
-    if effect is None:
+    change = dict(zip(aid_of(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
+    effect_sentence = _replayed_effect(analysis, change)
+    if effect_sentence is None:
         return
     forward_m, right_m = (round(part, 2) + 0.0 for part in (forward_m, right_m))
     sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
@@ -169,7 +179,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
         f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
-        f"lever arm. {effect}{NO_ESTIMATES}",
+        f"lever arm. {effect_sentence}{NO_ESTIMATES}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
@@ -186,17 +196,18 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
         return ""
     if not model.agreement.good or not is_source_fused(analysis, model.inputs):
         return ""
-    sizes_m = []
-    for run in (model.baseline_replay, *replay_settings(model, [change])):
-        track = run.published[inside_spans(run.published.index, run.evaluated_s)]
-        errors = [
-            track[name] - np.interp(track.index, truth.samples.index, truth.samples[name])
+    rmses_m = []
+    for replay in (model.baseline_replay, *replay_settings(model, [change])):
+        replayed_track = replay.published[inside_spans(replay.published.index, replay.evaluated_s)]
+        axis_errors_m = [
+            replayed_track[name]
+            - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])
             for name in Columns.POSITION[:2]
         ]
-        sizes_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*errors))))))
-    if sizes_m[1] > MAX_ERROR_RATIO * sizes_m[0]:
+        rmses_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*axis_errors_m))))))
+    if rmses_m[1] > MAX_LEVER_ARM_RMSE_RATIO * rmses_m[0]:
         return None
-    before, after = map(format_metres, sizes_m)
+    before, after = map(format_metres, rmses_m)
     return f"Replay of EKF2 with this lever arm: horizontal position RMSE {before} m → {after} m. "
 
 
@@ -204,33 +215,35 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect two senders whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
-    count, rate_hz = (len(samples) - 2) // WINDOW, analysis.source.rate_hz
-    if count < MIN_WINDOWS:
+    window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.rate_hz
+    if window_count < MIN_WINDOWS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
-    offset_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
-    offset_m[::2] *= -1.0
-    windows_m = np.median(offset_m[: count * WINDOW].reshape(count, WINDOW, -1), axis=1)
-    direction = windows_m[np.argmax(np.linalg.norm(windows_m, axis=1))]
-    windows_m[windows_m @ direction < 0.0] *= -1.0
-    offset = np.median(windows_m, axis=0)
-    scatter_m = 1.4826 * float(np.median(np.abs(windows_m - offset), axis=0).max())
-    size_m = float(np.linalg.norm(offset))
-    if size_m < max(MIN_OFFSET_M, MIN_OFFSET_SIGMAS * scatter_m):
+    offsets_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
+    offsets_m[::2] *= -1.0
+    window_offsets_m = np.median(
+        offsets_m[: window_count * WINDOW_SAMPLES].reshape(window_count, WINDOW_SAMPLES, -1), axis=1
+    )
+    largest_offset_m = window_offsets_m[np.argmax(np.linalg.norm(window_offsets_m, axis=1))]
+    window_offsets_m[window_offsets_m @ largest_offset_m < 0.0] *= -1.0
+    median_offset_m = np.median(window_offsets_m, axis=0)
+    scatter_m = 1.4826 * float(np.median(np.abs(window_offsets_m - median_offset_m), axis=0).max())
+    distance_m = float(np.linalg.norm(median_offset_m))
+    if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
-    axes = ", ".join(
+    distance_texts = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
-        for part, name in zip(offset, samples.columns, strict=True)
+        for part, name in zip(median_offset_m, samples.columns, strict=True)
     )
     yield error(
         "source_two_senders",
-        f"Two systems alternately send positions that differ by {size_m:.2f} m. Every other one of "
-        f"the {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. "
-        f"{NO_ESTIMATES}",
+        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Every other "
+        f"one of the {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differs by "
+        f"{distance_texts}. {NO_ESTIMATES}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
-        {"distance_m": size_m, "rate_hz": rate_hz},
+        {"distance_m": distance_m, "rate_hz": rate_hz},
     )
 
 
@@ -241,40 +254,46 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return
     samples = cut_to_segment(source.samples, segment)[Columns.POSITION].dropna()
     state = ekf2.state.dropna()
-    if len(samples) < WINDOW or len(state) < WINDOW:
+    if len(samples) < WINDOW_SAMPLES or len(state) < WINDOW_SAMPLES:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
-    differences = [_difference_m(position_m, time_s - d, state) for d in DELAYS_S]
-    best = int(np.nanargmin(differences)) if np.isfinite(differences).any() else 0
-    fusing = ekf2.fusion_flags
-    is_fused = isinstance(fusing, Unavailable) or bool(
-        (fusing["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
+    distances_m = [
+        _median_distance_m(position_m, time_s - delay_s, state) for delay_s in COPY_DELAYS_S
+    ]
+    best_index = int(np.nanargmin(distances_m)) if np.isfinite(distances_m).any() else 0
+    fusion_flags = ekf2.fusion_flags
+    is_fused = isinstance(fusion_flags, Unavailable) or bool(
+        (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
     )
-    if not differences[best] < (MAX_FOLLOWED_COPY_M if is_fused else MAX_COPY_M):
+    if not distances_m[best_index] < (
+        MAX_FUSED_COPY_DISTANCE_M if is_fused else MAX_COPY_DISTANCE_M
+    ):
         return
     convention = analysis.convention
     orientation = convention.orientation if convention else None
     is_copied = orientation and orientation.verdict == "copied"
-    quantity = "position and attitude" if is_copied else "position"
+    copied_quantity = "position and attitude" if is_copied else "position"
     yield error(
         "source_is_ekf2_estimate",
-        f"{source_name(source)} sends EKF2's own {quantity} back. The positions equal EKF2's "
-        f"position {1e3 * DELAYS_S[best]:.0f} ms earlier (median difference "
-        f"{1e3 * differences[best]:.1f} mm). They contain no measurement: EKF2's σ decreases, "
-        "its error does not.",
+        f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal "
+        f"EKF2's position {1e3 * COPY_DELAYS_S[best_index]:.0f} ms earlier (median difference "
+        f"{1e3 * distances_m[best_index]:.1f} mm). They contain no measurement: EKF2's σ "
+        "decreases, its error does not.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
-        {"delay_s": float(DELAYS_S[best]), "difference_m": differences[best]},
+        {"delay_s": float(COPY_DELAYS_S[best_index]), "difference_m": distances_m[best_index]},
     )
 
 
-def _difference_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
+def _median_distance_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
     """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
-    at = state.index.to_numpy()
-    curve = CubicHermiteSpline(at, state[Columns.POSITION], state[Columns.VELOCITY])
-    is_moving = np.linalg.norm(curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
-    is_inside = (time_s > at[0]) & (time_s < at[-1]) & is_moving
-    if np.count_nonzero(is_inside) < WINDOW:
+    state_times_s = state.index.to_numpy()
+    state_curve = CubicHermiteSpline(
+        state_times_s, state[Columns.POSITION], state[Columns.VELOCITY]
+    )
+    is_moving = np.linalg.norm(state_curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
+    is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
+    if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
         return float("nan")
-    distance_m = np.linalg.norm(position_m - curve(time_s), axis=1)
+    distance_m = np.linalg.norm(position_m - state_curve(time_s), axis=1)
     return float(np.median(distance_m[is_inside]))

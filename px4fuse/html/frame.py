@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
+from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
 
 MAX_PAGE_ROWS = 100  # maximum number of rows on one page of the table
 MAX_PLAIN_ROWS = 300  # maximum number of rows of the plain table, for browsers without scripts
@@ -147,15 +147,15 @@ def page(
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
-    content = {
+    page_data = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
         "rows": [
             (
-                [_compact(cell) for cell in row.cells],
+                [_compact_cell(cell) for cell in row.cells],
                 row.tags,
                 *(
-                    [section for section in column if section[2]]
-                    for column in (row.details, row.side_sections)
+                    [section for section in column_sections if section[2]]
+                    for column_sections in (row.details, row.side_sections)
                 ),
             )
             for row in rows
@@ -165,8 +165,8 @@ def page(
         "axis": ratio_axis or {},
     }
     return load_template("html/frame.html").render(
-        style_hash=policy_hash(style),
-        script_hash=policy_hash(script),
+        style_hash=csp_hash(style),
+        script_hash=csp_hash(script),
         style=style,
         script=script,
         title=title,
@@ -180,14 +180,14 @@ def page(
         rows=rows,
         plain_rows=MAX_PLAIN_ROWS,
         full_table_note=full_table_note,
-        content=inert_json(clean_values(content)),
+        content=inert_json(clean_values(page_data)),
     )
 
 
-def _compact(cell: Cell) -> list[Any]:
+def _compact_cell(cell: Cell) -> list[Any]:
     # short fields keep the page small: True is a value equal to the text
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
-    fields = [cell.text, value, cell.below, cell.style_class]
-    while fields and fields[-1] == "":
-        fields.pop()
-    return fields
+    cell_fields = [cell.text, value, cell.below, cell.style_class]
+    while cell_fields and cell_fields[-1] == "":
+        cell_fields.pop()
+    return cell_fields

@@ -49,7 +49,7 @@ def inert_json(value: object) -> str:
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
-def policy_hash(text: str) -> str:
+def csp_hash(text: str) -> str:
     """Return the SHA-256 hash of a script or style for the content security policy."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 

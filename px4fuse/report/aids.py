@@ -21,9 +21,9 @@ LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
-AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
-MAX_NORMALISED = 4.0  # maximum ν/√S of the plots; larger values are drawn as triangles
-# The report of a comparison has this page if EKF2 fused one of these aiding sources
+AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
+MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
+# Aiding sources for which the report of a comparison has a page on EKF2's aiding sources
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
@@ -63,18 +63,18 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     for aid in aids.values():
         if aid.verdict == "disabled":
             continue
-        enabled_percent = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
-        noise = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
-        colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
+        enabled_text = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
+        noise_text = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
+        verdict_colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
         if aid.is_faulty:
-            colour = style.SEVERITY_COLOURS["warning"]
+            verdict_colour = style.SEVERITY_COLOURS["warning"]
         aid_cells: list[Cell] = [
             aid.label,
-            (format_aid_verdict(aid), colour),
-            enabled_percent,
+            (format_aid_verdict(aid), verdict_colour),
+            enabled_text,
             f"{aid.rejected_fraction:.1%}",
             f"{aid.longest_gap_duration_s:.1f}",
-            noise,
+            noise_text,
         ]
         axis_rows: list[list[Cell]] = [
             [
@@ -121,46 +121,70 @@ def format_aid_verdict(aid: AidResult) -> str:
 
 
 def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
-    span = flight_span(flight)
-    if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
+    flight_span_s = flight_span(flight)
+    if isinstance(flight.ekf2, Unavailable) or isinstance(flight_span_s, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
     page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
-        f"were not fused. Grey: fusion was disabled. Triangles: values beyond ±{MAX_NORMALISED:g}."
+        "were not fused. Grey: fusion was disabled. Triangles: values beyond "
+        f"±{MAX_DRAWN_INNOVATION:g}."
     )
     for name in fused_names:
         _draw_aid_panel(
-            page, aids[name], flight.ekf2.aids[name], span, with_time_label=name == fused_names[-1]
+            page,
+            aids[name],
+            flight.ekf2.aids[name],
+            flight_span_s,
+            with_time_label=name == fused_names[-1],
         )
 
 
 def _draw_aid_panel(
-    page: Page, aid: AidResult, log: AidLog, span: tuple[float, float], *, with_time_label: bool
+    page: Page,
+    aid: AidResult,
+    aid_log: AidLog,
+    span_s: tuple[float, float],
+    *,
+    with_time_label: bool,
 ) -> None:
-    samples = log.samples.loc[span[0] : span[1]]
+    samples = aid_log.samples.loc[span_s[0] : span_s[1]]
     axes = page.panel(aid.label, "", AID_PANEL_HEIGHT, above=1.0)
     is_fused = (
         samples["fused"].to_numpy() > 0.0 if "fused" in samples else np.ones(len(samples), bool)
     )
-    for axis in log.axes:
-        normalised = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
-        for mask, dot_style in ((is_fused, style.DOTS["EKF2"]), (~is_fused, style.EKF2_REJECTED)):
-            draw_dots(axes, normalised[mask], MAX_NORMALISED, dot_style | {"ms": 1.4})
+    for axis in aid_log.axes:
+        normalised_innovations = samples[f"innovation_{axis}"] / np.sqrt(
+            samples[f"variance_{axis}"]
+        )
+        for is_drawn, dot_style in (
+            (is_fused, style.INNOVATION_DOTS["EKF2"]),
+            (~is_fused, style.REJECTED_DOTS),
+        ):
+            draw_dots(
+                axes,
+                normalised_innovations[is_drawn],
+                MAX_DRAWN_INNOVATION,
+                dot_style | {"ms": 1.4},
+            )
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
-    if log.enabled is not None:
-        grid = np.linspace(*span, 2000)
-        is_disabled = step_values_at(log.enabled, pd.Index(grid)) <= 0.0
+    if aid_log.enabled is not None:
+        times_s = np.linspace(*span_s, 2000)
+        is_disabled = step_values_at(aid_log.enabled, pd.Index(times_s)) <= 0.0
         if is_disabled.any():
             axes.fill_between(
-                grid,
-                -MAX_NORMALISED,
-                MAX_NORMALISED,
+                times_s,
+                -MAX_DRAWN_INNOVATION,
+                MAX_DRAWN_INNOVATION,
                 where=is_disabled.tolist(),
                 zorder=0.1,
                 **GROUND_BAND,
             )
-    axes.set(xlim=span, ylim=(-1.1 * MAX_NORMALISED, 1.1 * MAX_NORMALISED), yticks=(-2.0, 2.0))
+    axes.set(
+        xlim=span_s,
+        ylim=(-1.1 * MAX_DRAWN_INNOVATION, 1.1 * MAX_DRAWN_INNOVATION),
+        yticks=(-2.0, 2.0),
+    )
     style.label_time_axis(axes, with_time_label)

@@ -8,13 +8,13 @@ from markupsafe import Markup
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
 from px4fuse.card.model import (
-    AXIS_TICKS,
     FILTER_NAMES,
+    RATIO_AXIS_TICKS,
     Card,
     Verdict,
     axis_fraction,
 )
-from px4fuse.card.verdicts import verdicts
+from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
@@ -29,7 +29,7 @@ from px4fuse.report.card_text import (
     format_target,
     marked_actions,
     rerun_columns,
-    rerun_start,
+    rerun_note,
     with_typed_path,
 )
 
@@ -40,8 +40,8 @@ MARK_PATHS = {
     "below": "M5-7L-7 0L5 7z",
     "above": "M-5-7L7 0L-5 7z",
 }
-SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
+SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
+INTERVAL_END_HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
 
 
 def card_of(analysis: Analysis) -> Card:
@@ -77,7 +77,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
         signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
-        rerun_start=rerun_start,
+        rerun_note=rerun_note,
     )
 
 
@@ -90,11 +90,11 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
         verdicts=all_verdicts,
         axis=axis,
         name=name,
-        drawn=[_drawing(verdict) for verdict in all_verdicts],
+        drawn=[_verdict_drawing(verdict) for verdict in all_verdicts],
         alternative=alternative_text(all_verdicts),
         ticks=[
-            (_percent(tick), label, tick not in LABELLED_TICKS)
-            for tick, label in AXIS_TICKS.items()
+            (_axis_percent(tick), label, tick not in LABELLED_TICKS)
+            for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=band_limits(),
         names=FILTER_NAMES,
@@ -107,7 +107,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 def axis_figures(analysis: Analysis) -> str:
     """Return an HTML figure with the four σ ratios of KF and EKF2 for each axis."""
     return "".join(
-        axis_html(verdicts(result), describe_axis(analysis, result), name)
+        axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 
@@ -131,40 +131,42 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     """
     sentences = []
     for verdict in verdicts:
-        value = f"not evaluated, {verdict.reason}"
+        verdict_text = f"not evaluated, {verdict.reason}"
         if verdict.ratio is not None:
             suffix = ", explained" if verdict.is_explained else ""
-            value = f"{format_ratio(verdict.ratio)}, {verdict.word}{suffix}"
-        quantity = f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}"
-        sentences.append(f"{quantity}: {value}.")
+            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{suffix}"
+        quantity = f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
+        sentences.append(f"{quantity}: {verdict_text}.")
     return " ".join(sentences)
 
 
-def _percent(ratio: float) -> str:
+def _axis_percent(ratio: float) -> str:
     return f"{100.0 * min(max(axis_fraction(ratio), 0.0), 1.0):.2f}"
 
 
-def _drawing(verdict: Verdict) -> dict[str, Any]:
+def _verdict_drawing(verdict: Verdict) -> dict[str, Any]:
     # SVG positions are percentages, so the axis fits any width without style attributes, which the
     # security policy of the pages forbids
     if verdict.ratio is None:
         return {}
-    low, high = (axis_fraction(end) for end in CONSISTENT_RATIOS[verdict.against])
+    band_low, band_high = (axis_fraction(end) for end in CONSISTENT_RATIOS[verdict.against])
     fraction = axis_fraction(verdict.ratio)
-    symbol = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
-    marks = []
+    mark_name = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
+    interval_lines = []
     if verdict.interval is not None:
-        left_percent, right_percent = (_percent(max(end, 1e-9)) for end in verdict.interval)
-        marks.append(f'x1="{left_percent}%" x2="{right_percent}%" y1="10" y2="10"')
-        top, bottom = 10 - HALF_HEIGHT, 10 + HALF_HEIGHT
-        marks += [
-            f'x1="{x}%" x2="{x}%" y1="{top}" y2="{bottom}"' for x in (left_percent, right_percent)
+        left_percent, right_percent = (_axis_percent(max(end, 1e-9)) for end in verdict.interval)
+        interval_lines.append(f'x1="{left_percent}%" x2="{right_percent}%" y1="10" y2="10"')
+        end_top, end_bottom = 10 - INTERVAL_END_HALF_HEIGHT, 10 + INTERVAL_END_HALF_HEIGHT
+        interval_lines += [
+            f'x1="{x}%" x2="{x}%" y1="{end_top}" y2="{end_bottom}"'
+            for x in (left_percent, right_percent)
         ]
     return {
         "band": Markup(
-            f'x="{100.0 * low:.2f}%" width="{100.0 * (high - low):.2f}%" y="1" height="18"'
+            f'x="{100.0 * band_low:.2f}%" width="{100.0 * (band_high - band_low):.2f}%" '
+            'y="1" height="18"'
         ),
-        "interval": [Markup(mark) for mark in marks],
-        "mark": Markup(f' x="{_percent(verdict.ratio)}%"'),
-        "path": MARK_PATHS[symbol],
+        "interval": [Markup(line) for line in interval_lines],
+        "mark": Markup(f' x="{_axis_percent(verdict.ratio)}%"'),
+        "path": MARK_PATHS[mark_name],
     }

@@ -10,9 +10,9 @@ from typing import NamedTuple
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
-    AXIS_TICKS,
     FILTER_NAMES,
     MAX_NOTES,
+    RATIO_AXIS_TICKS,
     Action,
     AidRow,
     Card,
@@ -29,9 +29,9 @@ CARD_WIDTH = 100
 AXIS_WIDTH = 37
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters left of a text beside a label
-# Maximum length of a command beside its label; longer commands have their own line
+# Maximum length (characters) of a command on the line of its label
 MAX_COMMAND_LENGTH = 74
-# Ticks of the axis of σ ratios that have a label
+# σ ratios at labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
@@ -42,7 +42,12 @@ SEVERITY_SIGNS = {
     "clean": "✓ NO FAULT",
     "refused": "✕ REFUSED",
 }
-STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
+SEVERITY_STYLES = {
+    "error": "bold red",
+    "warning": "bold yellow",
+    "note": "cyan",
+    "clean": "bold green",
+}
 # ASCII replacements of characters, for terminals with an ASCII encoding
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
@@ -81,17 +86,17 @@ class Line(NamedTuple):
 
 def card_lines(card: Card) -> Iterator[Line]:
     if card.severity == "refused":
-        yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
+        yield Line(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
             yield from _labelled_lines(label, text)
         yield Line("No file was written. Exit code 2.")
         return
-    yield from _identity_line(card)
-    yield from _headline_lines(card)
+    yield from _identity_lines(card)
+    yield from _headline_and_action_lines(card)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
-            yield Line(title, STYLES[cause.severity])
+            yield Line(title, SEVERITY_STYLES[cause.severity])
         yield from _labelled_lines(
             f"cause {number}" if len(card.causes) > 1 else "cause", cause.why
         )
@@ -100,8 +105,8 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield Line(f"{card.more_causes} more causes are listed with -v")
     for label, text in card.facts.items():
         yield from _labelled_lines(label, text)
-    yield from _verdict_axis(card)
-    yield from _aid_axis(card.aids)
+    yield from _verdict_axis_lines(card)
+    yield from _aid_axis_lines(card.aids)
     for text in (card.reconcile, card.difference):
         yield from _wrapped_lines(text, "  ", "  ")
     if card.notes:
@@ -110,14 +115,16 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _wrapped_lines(text, "", "  ")
 
 
-def note_texts(card: Card, place: str) -> list[str]:
-    """Format the first notes of a card; ``place`` lists the other notes."""
+def note_texts(card: Card, other_notes_place: str) -> list[str]:
+    """Format the first notes of a card; ``other_notes_place`` lists the other notes."""
     texts = [
         " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
         for note in card.notes[:MAX_NOTES]
     ]
     omitted_count = len(card.notes) - MAX_NOTES
-    return texts + ([f"{omitted_count} more notes are listed {place}"] if omitted_count > 0 else [])
+    return texts + (
+        [f"{omitted_count} more notes are listed {other_notes_place}"] if omitted_count > 0 else []
+    )
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
@@ -142,12 +149,12 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     """
     if path is None:
         return card
-    name, typed_name = (
+    quoted_name, quoted_path = (
         json.dumps(text)[1:-1] for text in (shlex.quote(card.identity.file), quote_command([path]))
     )
-    command = re.compile(rf"(px4fuse \w+ ){re.escape(name)}")
-    content = command.sub(lambda match: match[1] + typed_name, json.dumps(to_builtins(card)))
-    return convert(json.loads(content), Card)
+    command = re.compile(rf"(px4fuse \w+ ){re.escape(quoted_name)}")
+    card_json = command.sub(lambda match: match[1] + quoted_path, json.dumps(to_builtins(card)))
+    return convert(json.loads(card_json), Card)
 
 
 def to_ascii(text: str) -> str:
@@ -178,25 +185,25 @@ def axis_text(ratio: float | None, reference: Reference) -> str:
     >>> axis_text(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_column(end) for end in CONSISTENT_RATIOS[reference])
+    low, high = (_axis_column(end) for end in CONSISTENT_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
-        column = _column(ratio)
+        column = _axis_column(ratio)
         is_inside = 0 <= column < AXIS_WIDTH
         symbol = MARKS[reference] if is_inside else "▶" if column > 0 else "◀"
         characters[min(max(column, 0), AXIS_WIDTH - 1)] = symbol
     return "".join(characters)
 
 
-def _column(ratio: float) -> int:
+def _axis_column(ratio: float) -> int:
     return round(axis_fraction(ratio) * (AXIS_WIDTH - 1))
 
 
-def _identity_line(card: Card) -> Iterator[Line]:
+def _identity_lines(card: Card) -> Iterator[Line]:
     identity = card.identity
-    flight = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
-    student = ", ".join(filter(None, (identity.student, identity.student_id)))
-    yield Line(f"{identity.file}  {flight}{f'  {student}' if student else ''}")
+    flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
+    student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
+    yield Line(f"{identity.file}  {flight_text}{f'  {student_text}' if student_text else ''}")
     if identity.settings:
         yield from _wrapped_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
@@ -205,15 +212,15 @@ def _identity_line(card: Card) -> Iterator[Line]:
     yield Line("")
 
 
-def headline(card: Card) -> Iterator[Line]:
+def headline_lines(card: Card) -> Iterator[Line]:
     """Yield the line with severity, id and headline."""
     label = "ok" if card.severity == "clean" else card.severity
     name = f"{label}[{card.id}]" if card.id else label
-    yield Line(f"{name}: {card.headline}", STYLES[card.severity])
+    yield Line(f"{name}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _headline_lines(card: Card) -> Iterator[Line]:
-    yield from headline(card)
+def _headline_and_action_lines(card: Card) -> Iterator[Line]:
+    yield from headline_lines(card)
     yield from _labelled_lines("effect", card.effect_text)
     for place, text in enumerate(card.do_this):
         yield from _labelled_lines("" if place else "do this", text)
@@ -221,12 +228,12 @@ def _headline_lines(card: Card) -> Iterator[Line]:
 
 def _cause_lines(cause: Cause) -> Iterator[Line]:
     yield from _labelled_lines("when", format_spans(cause))
-    rows = marked_actions(cause)
-    labels = [f"{mark}{format_target(action)}" for mark, action in rows]
-    width = max(map(len, labels), default=0) + 2
-    for label, (_, action) in zip(labels, rows, strict=True):
-        yield from _action_lines(label, width, action)
-    yield from _rerun_table(cause.reruns)
+    actions = marked_actions(cause)
+    labels = [f"{mark}{format_target(action)}" for mark, action in actions]
+    label_width = max(map(len, labels), default=0) + 2
+    for label, (_, action) in zip(labels, actions, strict=True):
+        yield from _action_lines(label, label_width, action)
+    yield from _rerun_table_lines(cause.reruns)
     yield from _wrapped_lines(cause.after, "  ", "  ")
 
 
@@ -244,9 +251,9 @@ def format_target(action: Action) -> str:
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
-def _action_lines(label: str, width: int, action: Action) -> Iterator[Line]:
-    indent = " " * (2 + width)
-    label_text = f"  {label:{width}}"
+def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Line]:
+    indent = " " * (2 + label_width)
+    label_text = f"  {label:{label_width}}"
     if action.sentence:
         yield from _wrapped_lines(action.sentence, label_text, indent)
         label_text = indent
@@ -259,14 +266,14 @@ def _action_lines(label: str, width: int, action: Action) -> Iterator[Line]:
         label_text = indent
 
 
-def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
+def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Line]:
     columns = rerun_columns(reruns)
     widths = [max(map(len, column)) for column in columns]
     for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Line(f"  {'  '.join(cells)}".rstrip())
-    if start := rerun_start(reruns):
-        yield Line(f"  {start}")
+    if note := rerun_note(reruns):
+        yield Line(f"  {note}")
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
@@ -275,27 +282,38 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
             "position RMSE",
-            [_change_text(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
+            [_before_after_text(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
         ),
-        ("● innovation ÷ √S", [_change_text(rerun.source_ratio, format_ratio) for rerun in reruns]),
-        ("◆ error ÷ σ", [_change_text(rerun.truth_ratio, format_ratio) for rerun in reruns]),
-        ("rejected", [_change_text(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
+        (
+            "● innovation ÷ √S",
+            [_before_after_text(rerun.source_ratio, format_ratio) for rerun in reruns],
+        ),
+        ("◆ error ÷ σ", [_before_after_text(rerun.truth_ratio, format_ratio) for rerun in reruns]),
+        (
+            "rejected",
+            [
+                _before_after_text(rerun.rejected_fraction, _format_percent, " %")
+                for rerun in reruns
+            ],
+        ),
         ("improves", [rerun.improves for rerun in reruns]),
     )
     return [(head, *cells) for head, cells in columns if any(cells)]
 
 
-def rerun_start(reruns: Sequence[Rerun]) -> str:
-    starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
-    if not starts:
+def rerun_note(reruns: Sequence[Rerun]) -> str:
+    starts_s = {
+        rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
+    }
+    if not starts_s:
         return ""
     return (
         "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values exclude gaps and "
-        f"the time before {min(starts):.0f} s."
+        f"the time before {min(starts_s):.0f} s."
     )
 
 
-def _change_text(
+def _before_after_text(
     before_and_after: tuple[float, float] | None,
     format_value: Callable[[float], str],
     unit: str = "",
@@ -303,20 +321,22 @@ def _change_text(
     return " → ".join(map(format_value, before_and_after)) + unit if before_and_after else ""
 
 
-def _percent(fraction: float) -> str:
+def _format_percent(fraction: float) -> str:
     return f"{100.0 * fraction:.0f}"
 
 
-def _verdict_axis(card: Card) -> Iterator[Line]:
+def _verdict_axis_lines(card: Card) -> Iterator[Line]:
     if not card.verdicts:
         return
-    axis_text = "" if card.effect is None else f", {card.effect.axis}"
+    direction_text = "" if card.effect is None else f", {card.effect.axis}"
     yield Line("")
     heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
-    yield from _wrapped_lines(f"{heading}{axis_text}", "", "  ")
+    yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
     legend = f"  ░ consistent ({band_limits()})"
-    sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
-    yield Line(f"{'':{AXIS_INDENT}}{sides}")
+    side_labels = (
+        f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
+    )
+    yield Line(f"{'':{AXIS_INDENT}}{side_labels}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Line("  Verdicts in brackets are not faults of the filter: the causes explain them.")
@@ -327,12 +347,12 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
 def _verdict_line(verdict: Verdict) -> Line:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
-    head = f"  {filter_label:4} {quantity:25}"
+    label_text = f"  {filter_label:4} {quantity:25}"
     if verdict.ratio is None:
         text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Line(text, "", head, " " * 41, wraps=True)
+        return Line(text, "", label_text, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
-    text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
+    text = f"{label_text}{format_ratio(verdict.ratio):>7}  {word}"
     style = "bold" if verdict.is_fault else ""
     return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
 
@@ -340,26 +360,26 @@ def _verdict_line(verdict: Verdict) -> Line:
 def _ticks_line() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_TICKS:
-        label = AXIS_TICKS[tick]
-        start = min(max(_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
+        label = RATIO_AXIS_TICKS[tick]
+        start = min(max(_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
         characters[start : start + len(label)] = label
     return "".join(characters)
 
 
-def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
+def _aid_axis_lines(aids: Sequence[AidRow]) -> Iterator[Line]:
     if not aids:
         return
     yield Line("")
     yield from _wrapped_lines(AIDS_HEADING, "", "  ")
     indent = 31
     yield Line(f"{'':{indent}}{_ticks_line()}")
-    previous = ""
+    previous_label = ""
     for row in aids:
-        label = row.label if row.label != previous else ""
-        previous = row.label
-        ratio = "–" if row.ratio is None else format_ratio(row.ratio)
-        head = f"  {label:13}{row.component:6}{ratio:>7}"
-        yield Line(f"{head:{indent}}{axis_text(row.ratio, 'source')}")
+        label = row.label if row.label != previous_label else ""
+        previous_label = row.label
+        ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
+        label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
+        yield Line(f"{label_text:{indent}}{axis_text(row.ratio, 'source')}")
 
 
 def format_spans(cause: Cause) -> str:

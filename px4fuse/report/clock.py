@@ -11,26 +11,26 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
-from px4fuse.report.style import KF_BAND_COLOUR, LINES, Axes
+from px4fuse.report.style import KF_BAND_COLOUR, TRACK_LINES, Axes
 from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
-MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
-# Half width of the plot, in half widths of the 95 % interval
-CURVE_HALF_WIDTH = 2.5
-# Ids of the findings for which the report has an appendix on the time offset
+MAX_DRAWN_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
+# Half width of the log-likelihood plot, in half widths of the 95 % interval of the offset
+PLOT_HALF_WIDTH_INTERVALS = 2.5
+# Findings for which the report has an appendix on the time offset
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
-def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
+def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset of the position source in one line."""
-    if has_page(analysis, findings):
+    if has_clock_page(analysis, findings):
         return "The appendix on the time offset contains the estimate."
     advice = clock_advice(analysis, analysis.clock)
     return " ".join(advice[label] for label in ("Result", "Offset") if label in advice)
 
 
-def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
+def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     """Return True if the time offset is a finding or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
@@ -47,61 +47,67 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             "Offset": f"The time offset cannot be estimated: {clock.reason}.",
             "Action": "Fly passes of 5 m or more, and stop after each pass.",
         }
-    offset, (low, high) = clock.offset_s, clock.interval_s
+    offset_s, (low_s, high_s) = clock.offset_s, clock.interval_s
     advice = {
         "Result": "The position source has no significant time offset.",
         "Offset": (
-            f"Add {offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s) to the timestamps of the "
-            "position source."
+            f"Add {offset_s:+.3f} s (95 % {low_s:+.3f} to {high_s:+.3f} s) to the timestamps of "
+            "the position source."
         ),
     }
-    if clock.is_significant(offset):
-        side = "late" if offset < 0.0 else "early"
-        advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
-        typed_offset = clock_offset_option_s(comparison, clock)
-        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
+    if clock.is_significant(offset_s):
+        side = "late" if offset_s < 0.0 else "early"
+        advice["Result"] = f"The position timestamps are {abs(offset_s):.3f} s {side}."
+        option_s = clock_offset_option_s(comparison, clock)
+        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {option_s:.3f}"
     if (flown_ms := delay_ms(comparison)) is not None:
         advice["PX4"] = _delay_advice(comparison, clock, flown_ms)
     if clock.changes:
-        offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
+        offset_texts = ", ".join(
+            f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
+        )
         advice["Changes"] = f"The offset changes during the flight: {offset_texts}."
     source = comparison.source
-    if drift := convention_faults(
+    if clock_drift := convention_faults(
         comparison.convention, comparison.flight, source.frame
     ).clock_drift:
         advice["Drift"] = (
-            f"The clock of the timestamps is {abs(100.0 * drift):.1f} % "
-            f"{'fast' if drift > 0.0 else 'slow'}. The offset applies to the middle of the data."
+            f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "
+            f"{'fast' if clock_drift > 0.0 else 'slow'}. The offset applies to the middle of the "
+            "data."
         )
     elif clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * clock.drift_sigma_ppm
-        note = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
+        significance_text = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
         advice["Drift"] = (
             f"The clock of the source drifts by {clock.drift_ppm:+.0f} ± {half_width_ppm:.0f} ppm "
-            f"(95 %){note}."
+            f"(95 %){significance_text}."
         )
     return advice
 
 
 def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
-    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
+    delay_parameter, ml_delay_ms = (
+        aid_of(comparison).delay,
+        wrong_delay_ms(comparison, clock, flown_ms),
+    )
     if ml_delay_ms is None:
-        return f"{name} {flown_ms:g} ms agrees with the estimate."
-    if limit := delay_limit(name, ml_delay_ms, flown_ms):
+        return f"{delay_parameter} {flown_ms:g} ms agrees with the estimate."
+    if limit_text := delay_limit(delay_parameter, ml_delay_ms, flown_ms):
         return (
-            f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot {limit}. "
-            "Correct the sender's clock."
+            f"The maximum-likelihood {delay_parameter} is {ml_delay_ms:.0f} ms, but "
+            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or correct the "
-        "sender's clock."
+        f"Set {delay_parameter} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or "
+        "correct the sender's clock."
     )
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on the time offset of the position source if :func:`has_page`."""
+    """Draw the appendix on the time offset of the position source if :func:`has_clock_page`."""
     clock = analysis.clock
-    if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
+    if isinstance(clock, Unavailable) or not has_clock_page(analysis, results.findings):
         return
     page = Page(
         "Appendix: time offset of the position source",
@@ -124,16 +130,16 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
-    (low, high), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
-    axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(clock.curve_s, clock.curve_drop, **LINES["KF"])
+    (low_s, high_s), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
+    axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
+    axes.plot(clock.curve_s, clock.curve_drop, **TRACK_LINES["KF"])
     axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
-    axes.set_ylim(min(MAX_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
-    half_width = CURVE_HALF_WIDTH * max(high - estimate_s, estimate_s - low)
-    ends = clock.curve_s[0], clock.curve_s[-1]
+    axes.set_ylim(min(MAX_DRAWN_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
+    half_width_s = PLOT_HALF_WIDTH_INTERVALS * max(high_s - estimate_s, estimate_s - low_s)
+    curve_ends_s = clock.curve_s[0], clock.curve_s[-1]
     axes.set_xlim(
-        min(max(estimate_s - half_width, ends[0]), applied_s - 0.1 * half_width),
-        max(min(estimate_s + half_width, ends[1]), applied_s + 0.1 * half_width),
+        min(max(estimate_s - half_width_s, curve_ends_s[0]), applied_s - 0.1 * half_width_s),
+        max(min(estimate_s + half_width_s, curve_ends_s[1]), applied_s + 0.1 * half_width_s),
     )
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

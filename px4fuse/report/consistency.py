@@ -18,45 +18,45 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_fraction
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Cell, Page, draw_legend_above, halves
+from px4fuse.report.page import Cell, Page, draw_legend_above, two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
-    VERDICT_HEAD,
+    VERDICT_TABLE_HEAD,
     filters_by_name,
     format_noise_estimate,
     format_settings,
     verdict_rows,
 )
 from px4fuse.report.style import (
-    DOTS,
+    INNOVATION_DOTS,
     KF_COLOUR,
-    LINES,
     MUTED_COLOUR,
+    TRACK_LINES,
     Axes,
     draw_curve,
     line_style,
     set_plain_ticks,
 )
 
-MAX_LAG = 20
-MAX_NORMALISED = 4.0
-HISTOGRAM_EDGES = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Maximum of the density axis, so that the normal density (maximum 0.4) remains visible
+MAX_AUTOCORRELATION_LAG = 20
+MAX_DRAWN_INNOVATION = 4.0
+HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 33)
+# Maximum of the density axis of the histogram: the normal density (maximum 0.4) remains visible
 MAX_DENSITY = 1.6
-# Maximum p value of the Ljung-Box test at which innovations are called "not white"
+# Maximum p value of the Ljung-Box test for the text "not white"
 MAX_NON_WHITE_P = 0.01
-RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
-LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
+RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
+DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
 # Label of each statistic, and exponent of the printed value (0.5: square root)
-CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
+STATISTIC_LABELS_AND_POWERS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
     "difference": ("KF - EKF2 (m)", 1.0),
 }
-NOISE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
+NOISE_TABLE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
 
-Series = Mapping[str, "pd.Series[float]"]
+InnovationSeries = Mapping[str, "pd.Series[float]"]
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -69,26 +69,26 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
         f"along {axis_text}; the table lists all axes.",
     )
-    series = _series(result)
+    series = _tested_innovations(result)
     if series:
         axes = event_marks.panel(
             page,
             analysis,
             "Running mean NIS (log scale)",
             "",
-            RUNNING_HEIGHT,
+            RUNNING_NIS_HEIGHT,
             above=LEGEND_HEIGHT,
         )
         _draw_running_nis(axes, series)
         draw_legend_above(axes)
-        left_page, right_page = halves()
+        left_page, right_page = two_columns()
         left = left_page.panel(
-            "Distribution of ν/√S", "", LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
+            "Distribution of ν/√S", "", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
         right = right_page.panel(
             "Autocorrelation",
             _whiteness_sentence(result, series),
-            LOWER_HEIGHT,
+            DISTRIBUTION_HEIGHT,
             above=LEGEND_HEIGHT,
         )
         _draw_histogram(left, series)
@@ -101,7 +101,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes")
-    head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
+    head = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(
         head,
         verdict_rows(analysis.axes.values(), _statistic_cells),
@@ -114,7 +114,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     ]
     if noise_rows:
         page.heading("Maximum-likelihood noises of KF, with 95 % intervals")
-        page.table(NOISE_HEAD, noise_rows, right_aligned_columns=(1, 2))
+        page.table(NOISE_TABLE_HEAD, noise_rows, right_aligned_columns=(1, 2))
         page.write(f"This report uses {format_settings(analysis.settings)}.")
     _write_causes(page, analysis)
     yield page
@@ -123,16 +123,16 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 def _write_causes(page: Page, analysis: Analysis) -> None:
     """Write the table of re-runs of KF and EKF2, each with one changed setting."""
     axis = analysis.main.axis
-    tested: list[tuple[Trial, Statistic]] = []
+    tested_trials: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
-        tested += [(trial, statistic) for trial in trials]
+        tested_trials += [(trial, statistic) for trial in trials]
         cause = find_cause(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
-            tested.append((cause, "difference"))
+            tested_trials.append((cause, "difference"))
     rows: list[list[Cell]] = []
-    for trial, statistic in tested:
-        label, power = CAUSE_STATISTICS[statistic]
+    for trial, statistic in tested_trials:
+        label, power = STATISTIC_LABELS_AND_POWERS[statistic]
         values = (outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after))
         rows.append(
             [
@@ -156,31 +156,31 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     )
 
 
-def _series(result: AxisComparison) -> Series:
-    verdicts = filters_by_name(result)
+def _tested_innovations(result: AxisComparison) -> InnovationSeries:
+    consistency_by_name = filters_by_name(result)
     return {
         name: values
         for name, values in normalised_innovations(result).items()
-        if isinstance(verdicts.get(name), Consistency) and len(values) >= MIN_INNOVATIONS
+        if isinstance(consistency_by_name.get(name), Consistency) and len(values) >= MIN_INNOVATIONS
     }
 
 
 def _thin_line_style(name: str) -> dict[str, Any]:
-    return line_style(LINES[name]["color"], 0.6, (0, (1, 1.5)))
+    return line_style(TRACK_LINES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
-def _draw_running_nis(axes: Axes, series: Series) -> None:
+def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
     lowest_nis, highest_nis = 0.5, 2.0
     for name, values in series.items():
-        number = np.arange(1, len(values) + 1)
-        running = (values**2).cumsum() / number
-        draw_curve(axes, running.iloc[2:], **LINES[name], label=name)
-        drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
-        low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
-        time = values.index[drawn_counts - 1]
-        axes.plot(time, low, **_thin_line_style(name))
-        axes.plot(time, high, **_thin_line_style(name), label=f"95 % band {name}")
-        settled_nis = running.iloc[len(running) // 4 :]
+        innovation_counts = np.arange(1, len(values) + 1)
+        running_nis = (values**2).cumsum() / innovation_counts
+        draw_curve(axes, running_nis.iloc[2:], **TRACK_LINES[name], label=name)
+        drawn_counts = np.unique(np.geomspace(3, len(innovation_counts), 60).astype(int))
+        band_low, band_high = np.array([nis_band(int(count)) for count in drawn_counts]).T
+        drawn_times_s = values.index[drawn_counts - 1]
+        axes.plot(drawn_times_s, band_low, **_thin_line_style(name))
+        axes.plot(drawn_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
+        settled_nis = running_nis.iloc[len(running_nis) // 4 :]
         lowest_nis, highest_nis = (
             min(lowest_nis, 0.7 * settled_nis.min()),
             max(highest_nis, 1.4 * settled_nis.max()),
@@ -190,38 +190,44 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
     set_plain_ticks(axes.yaxis)
 
 
-def _draw_histogram(axes: Axes, series: Series) -> None:
-    x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
-    normal_density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(x, normal_density, color="#dcdcdc", lw=0, label="normal")
+def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
+    normalised_innovation = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
+    normal_density = np.exp(-0.5 * normalised_innovation**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(normalised_innovation, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in series.items():
         density, _ = np.histogram(
-            values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=HISTOGRAM_EDGES, density=True
+            values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION),
+            bins=HISTOGRAM_EDGES,
+            density=True,
         )
-        axes.stairs(density, HISTOGRAM_EDGES, **LINES[name], label=name)
+        axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
         density_limit = max(density_limit, float(density.max()))
-    axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
+    axes.set_xlim(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
     axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, series: Series) -> None:
+def _draw_autocorrelation(axes: Axes, series: InnovationSeries) -> None:
     for shift, (name, values) in zip((-0.18, 0.18), series.items(), strict=False):
-        lags = min(MAX_LAG, len(values) // 3)
-        r = autocorrelation(np.asarray(values, np.float64), lags)
-        positions = np.arange(1, lags + 1) + shift
-        axes.vlines(positions, 0.0, r, color=LINES[name]["color"], lw=1.2)
-        dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
-        axes.plot(positions, r, **dots, label=name)
+        lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
+        correlations = autocorrelation(np.asarray(values, np.float64), lag_count)
+        lag_positions = np.arange(1, lag_count + 1) + shift
+        axes.vlines(lag_positions, 0.0, correlations, color=TRACK_LINES[name]["color"], lw=1.2)
+        dots = INNOVATION_DOTS[name] | {
+            "ms": 3.0,
+            "mew": 0.6,
+            "mfc": KF_COLOUR if name == "KF" else "white",
+        }
+        axes.plot(lag_positions, correlations, **dots, label=name)
         half_band = _whiteness_half_band(values)
         axes.axhline(-half_band, **_thin_line_style(name))
         axes.axhline(half_band, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
-    axes.set_xlim(0.0, MAX_LAG + 1)
+    axes.set_xlim(0.0, MAX_AUTOCORRELATION_LAG + 1)
     axes.set_xlabel("lag (measurements)")
 
 
@@ -230,18 +236,20 @@ def _whiteness_half_band(values: pd.Series[float]) -> float:
     return float(1.96 / np.sqrt(len(values)))
 
 
-def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
+def _whiteness_sentence(result: AxisComparison, series: InnovationSeries) -> str:
     sentences = []
     for name, values in series.items():
         consistency = filters_by_name(result)[name]
         assert isinstance(consistency, Consistency)
-        r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
-        interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
-        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_half_band(values):
-            interpretation = f"{name} {'lags' if r > 0.0 else 'follows measurement noise'}"
+        lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p
+        interpretation = "white" if p_value >= MAX_NON_WHITE_P else "not white"
+        if p_value < MAX_NON_WHITE_P and abs(lag1_correlation) > _whiteness_half_band(values):
+            interpretation = (
+                f"{name} {'lags' if lag1_correlation > 0.0 else 'follows measurement noise'}"
+            )
         sentences.append(
-            f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "
-            f"{interpretation}."
+            f"{name}: lag-1 autocorrelation {lag1_correlation:+.2f}, Ljung-Box test "
+            f"{format_p_value(p_value)}: {interpretation}."
         )
     return "\n".join(sentences)
 

@@ -1,13 +1,13 @@
-"""Cover of a report: the diagnosis card, and plots below it."""
+"""First page of a report: the diagnosis card, and plots below it."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
-    AXIS_ENDS,
-    AXIS_TICKS,
     FILTER_NAMES,
+    RATIO_AXIS_ENDS,
+    RATIO_AXIS_TICKS,
     Action,
     AidRow,
     Card,
@@ -29,7 +29,7 @@ from px4fuse.report.card_text import (
     marked_actions,
     note_texts,
     rerun_columns,
-    rerun_start,
+    rerun_note,
 )
 from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Block, Page, to_typst_data
@@ -37,9 +37,9 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
-AXIS_TITLE = "Is the reported uncertainty right?"
-AXIS_TEXT = "RMS of actual error ÷ reported σ"
+MAX_FILE_NAME_LENGTH = 56  # maximum number of characters of the file name in the head
+RATIO_AXIS_TITLE = "Is the reported uncertainty right?"
+RATIO_AXIS_TEXT = "RMS of actual error ÷ reported σ"
 TERMS_NOTE = (
     "Source: positions that KF and EKF2 fuse. σ and √S: standard deviations of position and "
     "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "
@@ -68,15 +68,20 @@ def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
 def add_card(page: Page, card: Card) -> Block:
     """Add a diagnosis card to a page."""
     identity = card.identity
-    flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
-    more_causes = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
+    flight_texts = (
+        identity.firmware,
+        identity.hardware,
+        f"{identity.duration_s:.1f} s",
+        identity.source,
+    )
+    more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
         file=_shorten_middle(identity.file),
         student=[text for text in (identity.student, identity.student_id) if text],
-        flight=" · ".join(filter(None, flight)),
+        flight=" · ".join(filter(None, flight_texts)),
         changed=f"KF changed: {', '.join(identity.changed)}" if identity.changed else "",
         settings=f"KF: {identity.settings}" if identity.settings else "",
         parameters=", ".join(identity.parameters),
@@ -89,7 +94,7 @@ def add_card(page: Page, card: Card) -> Block:
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
         causes_legend=_causes_legend(card.causes),
         causes=[_cause_data(number, cause) for number, cause in enumerate(card.causes, start=1)],
-        more_causes=more_causes if card.more_causes else "",
+        more_causes=more_causes_text if card.more_causes else "",
         difference=card.difference,
         notes=note_texts(card, f"in {ALL_FINDINGS}"),
         terms=AIDS_TERMS if card.aids else TERMS_NOTE,
@@ -110,28 +115,33 @@ def _shorten_middle(name: str) -> str:
     >>> _shorten_middle("2026-04-02_14-13-00_" + "x" * 60 + "_issue.ulg")
     '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxxx_issue.ulg'
     """
-    half_length = MAX_FILE_LENGTH // 2
+    half_length = MAX_FILE_NAME_LENGTH // 2
     return (
-        name if len(name) <= MAX_FILE_LENGTH else f"{name[: half_length - 1]}…{name[-half_length:]}"
+        name
+        if len(name) <= MAX_FILE_NAME_LENGTH
+        else f"{name[: half_length - 1]}…{name[-half_length:]}"
     )
 
 
 def _axis_data(card: Card) -> dict[str, Any]:
-    intervals = "" if card.aids else " · ├─┤ 95 % interval"
-    ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
-    axis_text = f", {card.effect.axis}" if card.effect else ""
+    interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
+    ends_text = " and ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
+    direction_text = f", {card.effect.axis}" if card.effect else ""
     return {
-        "axis_title": AXIS_TITLE,
-        "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
-        "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ outside {ends}",
+        "axis_title": RATIO_AXIS_TITLE,
+        "axis_text": AIDS_HEADING if card.aids else f"{RATIO_AXIS_TEXT}{direction_text}",
+        "axis_legend": (
+            f"grey: consistent ({band_limits()}){interval_legend} · ◀ ▶ outside {ends_text}"
+        ),
         "ticks": [
-            {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
+            {"fraction": axis_fraction(tick), "label": label}
+            for tick, label in RATIO_AXIS_TICKS.items()
         ],
-        "rows": [*map(_verdict_row, card.verdicts), *map(_aid_row, card.aids)],
+        "rows": [*map(_verdict_row_data, card.verdicts), *map(_aid_row_data, card.aids)],
     }
 
 
-def _verdict_row(verdict: Verdict) -> dict[str, Any]:
+def _verdict_row_data(verdict: Verdict) -> dict[str, Any]:
     label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
     verdict_text = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
@@ -148,7 +158,7 @@ def _verdict_row(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _aid_row(row: AidRow) -> dict[str, Any]:
+def _aid_row_data(row: AidRow) -> dict[str, Any]:
     return {
         "filter": "ekf2",
         "label": "",
@@ -164,19 +174,21 @@ def _ratio_marks(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
-    beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
+    side_outside = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {
         "ratio": "" if ratio is None else format_ratio(ratio),
         "shape": "circle" if reference == "source" else "diamond",
         "fraction": fraction,
-        "beyond": beyond,
+        "beyond": side_outside,
         "band": [axis_fraction(end) for end in CONSISTENT_RATIOS[reference]],
-        "interval": None if interval is None or beyond else list(map(_clipped_place, interval)),
+        "interval": None
+        if interval is None or side_outside
+        else list(map(_clipped_axis_fraction, interval)),
     }
 
 
-def _clipped_place(ratio: float) -> float:
-    return min(max(axis_fraction(max(ratio, AXIS_ENDS[0])), 0.0), 1.0)
+def _clipped_axis_fraction(ratio: float) -> float:
+    return min(max(axis_fraction(max(ratio, RATIO_AXIS_ENDS[0])), 0.0), 1.0)
 
 
 def _causes_legend(causes: Sequence[Cause]) -> str:
@@ -195,7 +207,7 @@ def _cause_data(number: int, cause: Cause) -> dict[str, Any]:
         "why": cause.why,
         "actions": [_action_data(mark, action) for mark, action in marked_actions(cause)],
         "reruns": {"head": head, "rows": rows},
-        "after": " ".join(filter(None, (rerun_start(cause.reruns), cause.after))),
+        "after": " ".join(filter(None, (rerun_note(cause.reruns), cause.after))),
         "id": cause.id,
     }
 

@@ -1,4 +1,4 @@
-"""Plots of the cover: map, position errors of KF and EKF2, normalised innovations.
+"""Plots on the first page of a report: map, position errors of KF and EKF2, innovations ÷ √S.
 
 Values outside a plot over time are drawn as triangles at the edge of the plot.
 """
@@ -27,53 +27,53 @@ from px4fuse.report.page import (
     UNLABELLED_HEIGHT,
     Block,
     Page,
-    halves,
     line_count,
     text_width,
+    two_columns,
 )
 from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
-from px4fuse.report.style import LINES, Axes, draw_curve
+from px4fuse.report.style import TRACK_LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Ratio of length to width of a track above which the plots fill the page width
+# Minimum ratio of length to width of a track whose map fills the page width
 MIN_LONG_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Minimum height (points) below the card for the plots; with less, they are on the next page
-MIN_HEIGHT = 38.0 * POINTS_PER_MM
-# Minimum height (points) below the card for a plot of the innovations too
+# Minimum free height (points) below the diagnosis card for the plots
+MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
+# Minimum free height (points) below the diagnosis card for a plot of the innovations
 MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
 INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
 MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
-# Total height (points) of the plots if they are on the page after the card
+# Total height (points) of the plots on the page after the diagnosis card
 NEXT_PAGE_HEIGHT = 160.0 * POINTS_PER_MM
 TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
-TITLE_LINE = 10.5  # height (points) of each further line of a title
+TITLE_LINE_HEIGHT = 10.5  # height (points) of each further line of a title
 # Unused height (points): gap above the legend, and gap below the last plot
 UNUSED_HEIGHT = 15.0
-# Minimum height (points) of the innovation plot with ticks at ±2
-MIN_TICKS_HEIGHT = 48.0
+# Minimum height (points) of an innovation plot whose axis has ticks at ±2
+MIN_HEIGHT_WITH_TICKS_AT_2 = 48.0
 # Minimum width (points) of a plot with six ticks on the time axis
-MIN_WIDE_PANEL = 200.0
+MIN_WIDE_PLOT_WIDTH = 200.0
 LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
 # Fraction of the height of all plots that the innovation plot fills
 INNOVATION_FRACTION = 0.22
 # Fraction of the height of all plots that the map fills
 MAP_FRACTION = 0.25
-# Half height of the innovation plot in √S
-MAX_NORMALISED = 4.0
-# Height (points) below the axes, without and with labels of the time axis
+# Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
+MAX_DRAWN_INNOVATION = 4.0
+# Height (points) below a plot, without and with labels of the time axis
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 # Ratio of the length of the map to the length of the tracks
 MAP_MARGIN = 1.08
-# Maximum distance from the positions to the edge of the map, as a fraction of their extent
-MAP_REACH = 0.25
+# Maximum margin of the map around the positions, as a fraction of the extent of the positions
+MAX_MAP_MARGIN = 0.25
 MIN_MAP_LENGTH_M = 0.5
-# A title states the median of σ if the ratio of maximum to minimum is smaller, else the range
-MAX_SIGMA_RATIO = 1.5
-# Time (s) in which σ decreases at the start of the filter, excluded from σ in titles
+# Maximum ratio of largest to smallest σ for which the title of a plot states only the median
+MAX_CONSTANT_SIGMA_RATIO = 1.5
+# Time (s) after the start of a filter that σ in titles of plots excludes
 SETTLING_S = 2.0
 Coordinates = tuple[Array, Array]
 
@@ -108,28 +108,28 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     legend = add_legend(page, analysis)
     errors, innovations = _error_plots(analysis, card), _innovation_plot(analysis.main)
     flight_map = _flight_map(analysis, card)
-    height = free_height - legend["height"] - UNUSED_HEIGHT
-    if height < MIN_HEIGHT:
-        height = NEXT_PAGE_HEIGHT
+    plots_height = free_height - legend["height"] - UNUSED_HEIGHT
+    if plots_height < MIN_PLOTS_HEIGHT:
+        plots_height = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
-    min_height = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
-    innovation_height = float(np.clip(INNOVATION_FRACTION * height, *INNOVATION_HEIGHTS))
-    if flight_map.is_long and height >= min_height:
-        map_height = float(np.clip(MAP_FRACTION * height, *MAP_HEIGHTS))
+    min_long_map_height = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
+    innovation_height = float(np.clip(INNOVATION_FRACTION * plots_height, *INNOVATION_HEIGHTS))
+    if flight_map.is_long and plots_height >= min_long_map_height:
+        map_height = float(np.clip(MAP_FRACTION * plots_height, *MAP_HEIGHTS))
         _draw_map(page, analysis, flight_map, map_height)
-        error_heights = _equal_heights(page, errors, height - map_height - innovation_height)
+        error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
         _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
         return
-    columns, map_height = halves(), height
+    columns, map_height = two_columns(), plots_height
     if not errors:
         errors = [innovations]
-    elif height >= MIN_INNOVATIONS_HEIGHT:
+    elif plots_height >= MIN_INNOVATIONS_HEIGHT:
         map_height -= innovation_height
     _draw_map(columns[0], analysis, flight_map, map_height)
-    if map_height < height:
+    if map_height < plots_height:
         _draw_plots(columns[0], analysis, [innovations], [innovation_height])
     label_height = HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
-    heights = _equal_heights(columns[1], errors, height - label_height)
+    heights = _equal_heights(columns[1], errors, plots_height - label_height)
     heights[-1] += label_height
     _draw_plots(columns[1], analysis, errors, heights)
     page.add_columns(*columns, above=0.0)
@@ -141,7 +141,7 @@ def _draw_plots(
     """Draw plots over time; their heights (points) include titles and labels."""
     for plot, height in zip(plots, heights, strict=True):
         is_last = plot is plots[-1]
-        axes_height = height - _head_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
+        axes_height = height - _title_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
         axes = page.panel(plot.title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
         event_marks.draw_marks(axes, analysis)
         axes.locator_params(axis="x", nbins=_tick_count(page))
@@ -151,17 +151,17 @@ def _draw_plots(
 
 def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[float]:
     """Return heights (points) of plots whose axes have equal height."""
-    title_heights = [_head_height(page, plot.title) for plot in plots]
+    title_heights = [_title_height(page, plot.title) for plot in plots]
     axes_height = (total - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
 
 
 def _tick_count(page: Page) -> int:
-    return 6 if page.width > MIN_WIDE_PANEL else 4
+    return 6 if page.width > MIN_WIDE_PLOT_WIDTH else 4
 
 
-def _head_height(page: Page, title: str) -> float:
-    return TITLE_HEIGHT + TITLE_LINE * (line_count(title, page.width) - 1)
+def _title_height(page: Page, title: str) -> float:
+    return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (line_count(title, page.width) - 1)
 
 
 def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
@@ -174,15 +174,15 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
-        half_height = 1.1 * max(map(_shown_height, errors_by_filter.values()))
+        half_range_m = 1.1 * max(map(_error_range_m, errors_by_filter.values()))
         rmse_m = effect.position_rmse_m if effect else {}
         return [
             _error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
-                _format_size("RMSE", rmse_m.get(filter_name)),
+                _format_lengths("RMSE", rmse_m.get(filter_name)),
                 errors["error_m"],
                 {name: errors["sigma_m"]},
-                half_height,
+                half_range_m,
             )
             for filter_name, errors in errors_by_filter.items()
         ]
@@ -190,52 +190,52 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         return []
     time_s = result.ekf2_state.index.to_numpy()
     state, variance = kf_state_and_variance(result.replay, time_s)
-    difference = state["position_m"] - result.ekf2_state["position_m"]
-    if not difference.notna().any():
+    difference_m = state["position_m"] - result.ekf2_state["position_m"]
+    if not difference_m.notna().any():
         return []
-    sigmas = {
+    sigmas_m = {
         name: pd.Series(reported_sigma(time_s, frame, "position_variance_m2"), time_s)
         for name, frame in (("KF", variance), ("EKF2", result.ekf2_variance))
     }
-    limits_m = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
-    half_height = 1.1 * max(float(difference.abs().max()), *limits_m)
-    size = _format_size("RMS", effect.difference_rms_m if effect else None)
-    return [_error_plot("KF − EKF2 (m)", size, difference, sigmas, half_height)]
+    limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
+    half_range_m = 1.1 * max(float(difference_m.abs().max()), *limits_m)
+    size_texts = _format_lengths("RMS", effect.difference_rms_m if effect else None)
+    return [_error_plot("KF − EKF2 (m)", size_texts, difference_m, sigmas_m, half_range_m)]
 
 
-def _format_size(label: str, length_m: float | None) -> list[str]:
+def _format_lengths(label: str, length_m: float | None) -> list[str]:
     return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
 
 
 def _error_plot(
     label: str,
-    sizes: list[str],
-    curve: pd.Series[float],
+    size_texts: list[str],
+    error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
-    half_height: float,
+    half_range_m: float,
 ) -> TimePlot:
     known_sigmas = {
         name: known for name, sigma in sigmas.items() if not (known := sigma.dropna()).empty
     }
-    texts = [
+    sigma_texts = [
         f"{name} {_format_sigma(sigma)}" if len(sigmas) > 1 else _format_sigma(sigma)
         for name, sigma in known_sigmas.items()
     ]
-    if texts:
-        sizes = [*sizes, f"σ {', '.join(texts)}"]
-    line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
+    if sigma_texts:
+        size_texts = [*size_texts, f"σ {', '.join(sigma_texts)}"]
+    line = TRACK_LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
-        axes.set_ylim(-half_height, half_height)
+        axes.set_ylim(-half_range_m, half_range_m)
         for name, sigma in known_sigmas.items():
-            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.BANDS[name])
+            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
         axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, curve, **line)
+        draw_curve(axes, error_m, **line)
 
-    return TimePlot(f"{label}: {', '.join(sizes)}", draw)
+    return TimePlot(f"{label}: {', '.join(size_texts)}", draw)
 
 
-def _shown_height(errors: pd.DataFrame) -> float:
+def _error_range_m(errors: pd.DataFrame) -> float:
     largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
     return max(
         largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
@@ -245,31 +245,31 @@ def _shown_height(errors: pd.DataFrame) -> float:
 def _format_sigma(sigma: pd.Series[float]) -> str:
     settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SETTLING_S, sigma.index[-1])]
     low, high = float(settled_sigma.min()), float(settled_sigma.max())
-    if high < MAX_SIGMA_RATIO * low:
+    if high < MAX_CONSTANT_SIGMA_RATIO * low:
         return format_metres(float(settled_sigma.median()))
     return f"{format_metres(low)} to {format_metres(high)}"
 
 
 def _innovation_plot(result: AxisComparison) -> TimePlot:
     series = normalised_innovations(result)
-    symbols = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
-    title = f"Innovations ÷ √S ({symbols}): 95 % expected within ±2"
-    largest = [
+    legend = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
+    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
+    largest_texts = [
         f"{name} {format_ratio(ratio)}"
         for name, values in series.items()
-        if (ratio := float(values.abs().max())) > MAX_NORMALISED
+        if (ratio := float(values.abs().max())) > MAX_DRAWN_INNOVATION
     ]
-    if largest:
-        title += f"; ▲▼ outside ±{MAX_NORMALISED:g}, up to {', '.join(largest)}"
+    if largest_texts:
+        title += f"; ▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}"
 
     def draw(axes: Axes) -> None:
-        axes.set_ylim(-1.12 * MAX_NORMALISED, 1.12 * MAX_NORMALISED)
+        axes.set_ylim(-1.12 * MAX_DRAWN_INNOVATION, 1.12 * MAX_DRAWN_INNOVATION)
         height = axes.bbox.height * 72.0 / axes.figure.dpi
-        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_TICKS_HEIGHT else 4.0))
+        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         axes.axhline(0.0, color="black", lw=0.5)
         for name in reversed(series):
-            draw_dots(axes, series[name], MAX_NORMALISED, style.DOTS[name])
+            draw_dots(axes, series[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
 
     return TimePlot(title, draw)
 
@@ -297,18 +297,18 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map with the main axis to the right; without a main axis, north is up."""
-    aisle = next((line for line in analysis.lines if line.name == AISLE), None)
-    heading, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
-    if aisle is not None and aisle.heading_deg is not None:
-        heading, up_label = np.deg2rad(aisle.heading_deg % 180.0), "left (m)"
+    aisle_axis = next((line for line in analysis.lines if line.name == AISLE), None)
+    heading_rad, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
+    if aisle_axis is not None and aisle_axis.heading_deg is not None:
+        heading_rad, up_label = np.deg2rad(aisle_axis.heading_deg % 180.0), "left (m)"
         axis = card.effect.axis if card.effect else "along the aisle"
         right_labels = [f"{text} (m)" for text in (axis, axis.partition(", ")[2], "main axis")]
     elif analysis.source.frame == "FRD":
         name = analysis.source.name
         right_labels, up_label = [f"y of {name} (m)", "y (m)"], f"x of {name} (m)"
-    c, s = np.cos(heading), np.sin(heading)
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     tracks = {
-        name: (c * north + s * east, s * north - c * east)
+        name: (cosine * north + sine * east, sine * north - cosine * east)
         for name, (north, east) in _map_tracks(analysis).items()
     }
     return FlightMap(tracks, right_labels, up_label)
@@ -322,10 +322,14 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         name: np.nanmax(np.abs(track - np.clip(track, *limits)))
         for name, track in ((name, np.transpose(track)) for name, track in tracks.items())
     }
-    outside = [f"{name} {format_metres(d)} m" for name, d in distances_m.items() if d > 0.0]
-    if outside:
-        title = f"Map; largest distance outside the map: {', '.join(outside)}"
-        axes_height = height - _head_height(page, title) - HEIGHT_BELOW_AXES[True]
+    distance_texts = [
+        f"{name} {format_metres(distance_m)} m"
+        for name, distance_m in distances_m.items()
+        if distance_m > 0.0
+    ]
+    if distance_texts:
+        title = f"Map; largest distance outside the map: {', '.join(distance_texts)}"
+        axes_height = height - _title_height(page, title) - HEIGHT_BELOW_AXES[True]
         limits = _map_limits(tracks, width / axes_height)
     axes = page.panel(title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
     right_label = next(
@@ -340,34 +344,38 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         if name == "positions":
             axes.plot(right_m, up_m, **style.MEASUREMENT_DOTS | {"ms": 2.4})
         else:
-            stride = max(1, len(right_m) // style.MAX_POINTS)
-            axes.plot(right_m[::stride], up_m[::stride], **LINES[name])
+            stride = max(1, len(right_m) // style.MAX_WIDE_POINTS)
+            axes.plot(right_m[::stride], up_m[::stride], **TRACK_LINES[name])
     position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
     right_m, up_m = tracks["positions"]
     for times, mark in (
         (analysis.events.take_off_s, event_marks.TAKE_OFF_MARK),
         (analysis.events.landing_s, event_marks.LANDING_MARK),
     ):
-        nearest = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
-        axes.plot(right_m[nearest], up_m[nearest], **mark | {"ms": 9.0, "mec": "white", "mew": 0.8})
+        nearest_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
+        axes.plot(
+            right_m[nearest_rows],
+            up_m[nearest_rows],
+            **mark | {"ms": 9.0, "mec": "white", "mew": 0.8},
+        )
 
 
-def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> tuple[Array, Array]:
+def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
-    # MAP_REACH limits the other tracks, so a large error of a filter does not reduce the scale
-    middles, sizes = [], []
-    for side in (0, 1):
-        ends = [np.percentile(tracks["positions"][side], (1.0, 99.0))]
+    # MAX_MAP_MARGIN limits the other tracks, so a large error of a filter does not reduce the scale
+    middles_m, sizes_m = [], []
+    for axis_index in (0, 1):
+        ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
-            ends.append(_range_of(tracks["ground truth"][side]))
-        margin_m = MAP_REACH * (np.max(ends) - np.min(ends))
-        limits = np.min(ends) - margin_m, np.max(ends) + margin_m
-        ends += [np.clip(_range_of(track[side]), *limits) for track in tracks.values()]
-        middles.append(0.5 * (np.min(ends) + np.max(ends)))
-        sizes.append(max(MAP_MARGIN * (np.max(ends) - np.min(ends)), MIN_MAP_LENGTH_M))
-    length = max(sizes[0], sizes[1] * ratio)
-    half_size = 0.5 * np.array([length, length / ratio])
-    return np.array(middles) - half_size, np.array(middles) + half_size
+            ends_m.append(_range_of(tracks["ground truth"][axis_index]))
+        margin_m = MAX_MAP_MARGIN * (np.max(ends_m) - np.min(ends_m))
+        limits_m = np.min(ends_m) - margin_m, np.max(ends_m) + margin_m
+        ends_m += [np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()]
+        middles_m.append(0.5 * (np.min(ends_m) + np.max(ends_m)))
+        sizes_m.append(max(MAP_MARGIN * (np.max(ends_m) - np.min(ends_m)), MIN_MAP_LENGTH_M))
+    length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
+    half_size = 0.5 * np.array([length_m, length_m / aspect_ratio])
+    return np.array(middles_m) - half_size, np.array(middles_m) + half_size
 
 
 def _range_of(values: Array) -> Array:

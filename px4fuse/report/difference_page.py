@@ -1,4 +1,4 @@
-"""Page on the difference KF - EKF2: replace KF's settings by EKF2's, one at a time."""
+"""Report page that explains the difference between KF and EKF2, setting by setting."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,25 +15,25 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Page, halves
+from px4fuse.report.page import Page, two_columns
 from px4fuse.report.style import (
     EKF2_BAND_COLOUR,
     EKF2_COLOUR,
     KF_BAND_COLOUR,
     KF_COLOUR,
-    LINES,
     MUTED_COLOUR,
+    TRACK_LINES,
     Axes,
     draw_curve,
 )
 
 TITLE = "Difference between KF and EKF2, setting by setting"
-ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
+BAR_ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
 LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
-TIME_HEIGHT = 105.0  # height (points) of the axes of the difference over time
+TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over time
 # Style of the bar of a replaced setting that increases the difference KF - EKF2
-INCREASE_STYLE = {"color": "white", "hatch": "////"}
+INCREASE_BAR_STYLE = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -96,15 +96,17 @@ def unexplained_note(analysis: Analysis) -> str:
 def format_agreement(agreement: Agreement) -> str:
     """Format the agreement of the EKF2 replay with the log."""
     axes = agreement.axes.items()
-    correlation = ", ".join(f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes)
-    ratio = ", ".join(
+    correlation_text = ", ".join(
+        f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes
+    )
+    ratio_text = ", ".join(
         f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
         for _, axis in axes
     )
     return (
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
-        f"Correlation of {agreement.samples} innovations {correlation}; S of the replay ÷ S of the "
-        f"log {ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
+        f"Correlation of {agreement.samples} innovations {correlation_text}; S of the replay ÷ S "
+        f"of the log {ratio_text}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
         f"{agreement.rejected_fraction_logged:.1%})"
         + "".join(
             f". The replay of {AIDS[name].label} does not agree with the log and is not used: "
@@ -117,29 +119,34 @@ def format_agreement(agreement: Agreement) -> str:
 def _draw_axis(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
-    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
-    page.heading(f"{name}, {spans}")
+    span_texts = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
+    page.heading(f"{name}, {span_texts}")
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
-    names = [step.name for step in explanation.steps]
-    columns = halves(LEFT_COLUMN_FRACTION)
+    setting_names = [step.name for step in explanation.steps]
+    columns = two_columns(LEFT_COLUMN_FRACTION)
     quantities = (
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
     )
-    for column, left_edge, (quantity, unit, power, unexplained_mean_square) in zip(
+    for column, left_edge, (quantity, unit, squared_unit, unexplained_mean_square) in zip(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
-        total = getattr(explanation, f"{quantity}_mean_square_{power}")
-        steps = np.array(
-            [getattr(step, f"{quantity}_mean_square_{power}") for step in explanation.steps]
+        total_mean_square = getattr(explanation, f"{quantity}_mean_square_{squared_unit}")
+        mean_square_reductions = np.array(
+            [getattr(step, f"{quantity}_mean_square_{squared_unit}") for step in explanation.steps]
         )
         title, height = (
-            f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
-            ROW_HEIGHT * (len(names) + 2),
+            f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS",
+            BAR_ROW_HEIGHT * (len(setting_names) + 2),
         )
         axes = column.panel(title, "", height, left=left_edge)
-        _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained_mean_square / total)
+        _draw_waterfall(
+            axes,
+            setting_names,
+            100.0 * mean_square_reductions / total_mean_square,
+            100.0 * unexplained_mean_square / total_mean_square,
+        )
     axes.set_yticklabels([])
     page.add_columns(*columns)
     title = "Position difference KF - EKF2 (m, dark) and unexplained difference (light)"
@@ -147,44 +154,53 @@ def _draw_axis(
         page,
         analysis,
         title,
-        _time_sentence(explanation),
-        TIME_HEIGHT,
+        _largest_difference_sentence(explanation),
+        TIME_PLOT_HEIGHT,
         axis=name,
     )
-    position_difference, remainder = (
+    position_difference, unexplained_difference = (
         pd.Series(values, explanation.times_s)
         for values in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
     )
     for start, end in explanation.spans_s:
-        draw_curve(axes, position_difference.loc[start:end], **LINES["KF"])
-        draw_curve(axes, remainder.loc[start:end], color=EKF2_COLOUR, lw=0.8)
+        draw_curve(axes, position_difference.loc[start:end], **TRACK_LINES["KF"])
+        draw_curve(axes, unexplained_difference.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
 
 def _draw_waterfall(
-    axes: Axes, names: list[str], reductions: Array, unexplained_percent: float
+    axes: Axes, setting_names: list[str], reductions_percent: Array, unexplained_percent: float
 ) -> None:
     """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
-    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions)])
-    rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
-    style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}
-    axes.barh(0, 100.0, **style)
-    for row, (reduction, bar_start) in enumerate(zip(reductions, bar_ends, strict=False), start=1):
-        style |= {"color": KF_BAND_COLOUR, "hatch": ""} if reduction >= 0.0 else INCREASE_STYLE
-        axes.barh(row, -reduction, left=bar_start, **style)
+    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions_percent)])
+    row_count, right_end = len(setting_names) + 2, max(100.0, float(bar_ends.max()))
+    bar_style: dict[str, Any] = {
+        "height": 0.7,
+        "edgecolor": KF_COLOUR,
+        "lw": 0.6,
+        "color": KF_COLOUR,
+    }
+    axes.barh(0, 100.0, **bar_style)
+    for row, (reduction, bar_start) in enumerate(
+        zip(reductions_percent, bar_ends, strict=False), start=1
+    ):
+        bar_style |= (
+            {"color": KF_BAND_COLOUR, "hatch": ""} if reduction >= 0.0 else INCREASE_BAR_STYLE
+        )
+        axes.barh(row, -reduction, left=bar_start, **bar_style)
         axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
-    style |= {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR, "hatch": ""}
-    axes.barh(rows - 1, unexplained_percent, **style)
-    for row, percent in enumerate((100.0, *reductions, unexplained_percent)):
+    bar_style |= {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR, "hatch": ""}
+    axes.barh(row_count - 1, unexplained_percent, **bar_style)
+    for row, percent in enumerate((100.0, *reductions_percent, unexplained_percent)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
         axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
-    axes.set_yticks(range(rows), ["KF - EKF2, total", *names, "unexplained"])
-    axes.set_ylim(rows - 0.4, -0.6)
+    axes.set_yticks(range(row_count), ["KF - EKF2, total", *setting_names, "unexplained"])
+    axes.set_ylim(row_count - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
     axes.set_xlabel("% of the mean square difference")
     axes.grid(visible=False)
 
 
-def _time_sentence(explanation: DifferenceExplanation) -> str:
+def _largest_difference_sentence(explanation: DifferenceExplanation) -> str:
     largest_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
         f"Largest difference KF - EKF2: {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "

@@ -10,29 +10,29 @@ from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import Page, halves
+from px4fuse.report.page import Page, two_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
 # Indices of the horizontal and the vertical axis of the map
-MAP_AXES: Mapping[Frame, tuple[int, int]] = {
+MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
     "NED": (1, 0),
     "FRD": (1, 0),
     "ENU": (0, 1),
     "camera": (0, 2),
     "unknown": (0, 1),
 }
-# Intervals between poses above this multiple of the median interval are drawn as gaps
-MIN_GAP_STEPS = 10.0
+# Minimum ratio of an interval between poses to the median interval if it is drawn as a gap
+MIN_GAP_INTERVAL_RATIO = 10.0
 MAX_PATH_POINTS = 1200
-MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
+MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis: rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
 COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
-MAX_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
+MAX_RPE_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
@@ -68,9 +68,9 @@ def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw both paths from above before the alignment, and the aligned path coloured by error."""
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
-    map_axes = list(MAP_AXES[frame])
-    names = [AXES_OF_FRAME[frame][index] for index in map_axes]
-    left, right = halves()
+    axis_indices = list(MAP_AXIS_INDICES[frame])
+    names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
+    left, right = two_columns()
     unaligned_handles: dict[str, Artist] = {}
     if is_aligned:
         axes = left.panel("Before alignment", "", MAP_HEIGHT, left=LABEL_MARGIN)
@@ -78,13 +78,15 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            plot_path(axes, position_m[:, map_axes], evaluation.time_s, label=label, **line_style)
+            plot_path(
+                axes, position_m[:, axis_indices], evaluation.time_s, label=label, **line_style
+            )
         style.set_map_axes(axes, *names)
         unaligned_handles = _legend_handles(axes)
         left.write_small(unaligned_sentence(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
     axes = right.panel(title, "", MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
-    _draw_path(axes, evaluation, map_axes)
+    _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
     right.write_small("Darker poses have a larger error; × marks the largest one.")
     # both maps contain the reference
@@ -97,23 +99,23 @@ def _legend_handles(axes: Axes) -> dict[str, Artist]:
     return dict(zip(labels, handles, strict=True))
 
 
-def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
-    error, path = evaluation.position_error_m, evaluation.estimate_m[:, map_axes]
-    stride = max(1, len(error) // MAX_PATH_POINTS)
+def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> None:
+    error_m, path_m = evaluation.position_error_m, evaluation.estimate_m[:, axis_indices]
+    stride = max(1, len(error_m) // MAX_PATH_POINTS)
     dots = axes.scatter(
-        path[::stride, 0],
-        path[::stride, 1],
-        c=error[::stride],
+        path_m[::stride, 0],
+        path_m[::stride, 1],
+        c=error_m[::stride],
         s=9.0,
         cmap="copper_r",  # colours from light to dark, which differ in greyscale too
         linewidths=0,
         vmin=0.0,
-        vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
+        vmax=max(float(error_m.max()), MIN_ERROR_RANGE_M),
     )
-    reference_m = evaluation.reference_m[:, map_axes]
+    reference_m = evaluation.reference_m[:, axis_indices]
     plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE)
-    axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
-    worst_point = path[np.argmax(error)]
+    axes.plot(*path_m[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
+    worst_point = path_m[np.argmax(error_m)]
     axes.plot(*worst_point, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
     bar = axes.figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
     bar.set_label("APE (m)", labelpad=1)
@@ -121,7 +123,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
 
 
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
-    left, right = halves()
+    left, right = two_columns()
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
     origin_s = time_origin_s(evaluation)
     label = "time from the first pose (s)" if origin_s else "time (s)"
@@ -131,7 +133,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     page.add_columns(left, right)
     if _rpe_statistics(evaluation):
-        left, right = halves()
+        left, right = two_columns()
         _draw_rpe(left.panel("RPE for each delta (m)", "", PANEL_HEIGHT), evaluation)
         right.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
         page.add_columns(left, right)
@@ -139,20 +141,20 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
     """Draw the APE with its RMSE and maximum as horizontal lines."""
-    error, low, high = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
-    shown_along, values = style.decimate_series(x_values, error, style.MAX_POINTS_NARROW)
-    gap_indices = np.searchsorted(shown_along, x_values[_gap_indices(evaluation.time_s)])
+    error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
+    drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_POINTS)
+    gap_indices = np.searchsorted(drawn_x, x_values[_gap_indices(evaluation.time_s)])
     axes.plot(
-        np.insert(shown_along, gap_indices, np.nan),
-        np.insert(values, gap_indices, np.nan),
+        np.insert(drawn_x, gap_indices, np.nan),
+        np.insert(drawn_errors_m, gap_indices, np.nan),
         color=KF_COLOUR,
         lw=0.8,
     )
     for name, title, line_style in STATISTIC_LINES:
         value = getattr(evaluation.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
-    axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
-    axes.set_ylim(0.0, 1.08 * max(float(error.max()), MIN_ERROR_RANGE_M))
+    axes.set(xlim=(x_start, max(x_end, x_start + 1e-6)), xlabel=label)
+    axes.set_ylim(0.0, 1.08 * max(float(error_m.max()), MIN_ERROR_RANGE_M))
     axes.locator_params(axis="x", nbins=6)
     axes.locator_params(axis="y", nbins=4)
 
@@ -163,7 +165,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    shown_indices = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_DELTA_LABELS)
+    shown_indices = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_RPE_DELTA_LABELS)
     axes.set_xticks(shown_indices, [rpe_statistics[index][0].delta_text for index in shown_indices])
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
@@ -175,26 +177,31 @@ def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statist
 
 
 def _gap_indices(time_s: Array) -> IntArray:
-    steps = np.diff(time_s)
-    return np.asarray(np.flatnonzero(steps > MIN_GAP_STEPS * np.median(steps)) + 1)
-
-
-def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None:
-    """Draw a path, shape (n, 2), with gaps where the time has gaps."""
-    gaps = _gap_indices(time_s)
-    evenly_spaced = np.linspace(0, len(positions) - 1, min(len(positions), MAX_PATH_POINTS)).astype(
-        np.intp
+    intervals_s = np.diff(time_s)
+    return np.asarray(
+        np.flatnonzero(intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)) + 1
     )
-    selected = np.unique(np.concatenate([evenly_spaced, gaps]))
+
+
+def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
+    """Draw a path, shape (n, 2), with gaps where the time has gaps."""
+    gap_indices = _gap_indices(time_s)
+    evenly_spaced = np.linspace(
+        0, len(positions_m) - 1, min(len(positions_m), MAX_PATH_POINTS)
+    ).astype(np.intp)
+    drawn_indices = np.unique(np.concatenate([evenly_spaced, gap_indices]))
     axes.plot(
-        *np.insert(positions[selected], np.searchsorted(selected, gaps), np.nan, axis=0).T, **style
+        *np.insert(
+            positions_m[drawn_indices], np.searchsorted(drawn_indices, gap_indices), np.nan, axis=0
+        ).T,
+        **style,
     )
 
 
 def time_origin_s(evaluation: Evaluation) -> float:
     """Return the time of the first pose (s) if timestamps are UNIX time, else 0."""
-    start = float(evaluation.time_s[0])
-    return start if start > MIN_UNIX_TIME_S else 0.0
+    start_s = float(evaluation.time_s[0])
+    return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
 def summary(evaluation: Evaluation) -> str:
@@ -271,23 +278,26 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
 def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     """Return the caption of the RPE plot: growth of the RPE with distance or time."""
     interval_note = "RMSE with its 95 % interval."
-    rmse: dict[tuple[str, float], float] = {
+    rmse_by_unit_and_delta: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
         for error in rpe
         if isinstance(error.translation_m, Statistics)
         and error.translation_m.rmse > NEGLIGIBLE_ERROR_M
     }
-    units = [unit for unit, _ in rmse]
+    units = [unit for unit, _ in rmse_by_unit_and_delta]
     unit = max(units, key=units.count, default="")
-    deltas = sorted(delta for delta_unit, delta in rmse if delta_unit == unit)
+    deltas = sorted(delta for delta_unit, delta in rmse_by_unit_and_delta if delta_unit == unit)
     if len(deltas) < 2:
         return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
-    low, high = deltas[0], deltas[-1]
-    ratio, growth = high / low, rmse[unit, high] / rmse[unit, low]
+    smallest_delta, largest_delta = deltas[0], deltas[-1]
+    delta_ratio, rmse_ratio = (
+        largest_delta / smallest_delta,
+        rmse_by_unit_and_delta[unit, largest_delta] / rmse_by_unit_and_delta[unit, smallest_delta],
+    )
     return (
-        f"{interval_note} From {low:g} to {high:g} {unit} the RMSE grows {growth:.2g} times. "
-        f"Expected: 1 for independent noise, {np.sqrt(ratio):.2g} for a random walk, {ratio:.3g} "
-        "for a scale or heading error."
+        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit} the RMSE grows "
+        f"{rmse_ratio:.2g} times. Expected: 1 for independent noise, {np.sqrt(delta_ratio):.2g} "
+        f"for a random walk, {delta_ratio:.3g} for a scale or heading error."
     )
 
 
@@ -304,8 +314,8 @@ def describe_track(path: Trajectory) -> str:
 
 def describe_method(evaluation: Evaluation) -> str:
     association = evaluation.association
-    offset = evaluation.time_offset.offset_s
-    offset_text = "" if not offset else f"; time offset {offset:+.3f} s"
+    offset_s = evaluation.time_offset.offset_s
+    offset_text = "" if not offset_s else f"; time offset {offset_s:+.3f} s"
     return (
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "

@@ -10,7 +10,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import (
-    EKF2_REJECTED,
+    REJECTED_DOTS,
     Artist,
     Axes,
     dot_style,
@@ -18,14 +18,16 @@ from px4fuse.report.style import (
 )
 
 # Bands differ in shade and hatching, so they remain distinct in greyscale
-_FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
-GROUND_BAND, DROPOUT_BAND = ({"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8"))
-GAP_BAND = _FILLED | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
+_BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
+GROUND_BAND, DROPOUT_BAND = (
+    {"facecolor": colour, **_BAND_STYLE} for colour in ("#e4e4e4", "#a8a8a8")
+)
+GAP_BAND = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
 RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
 OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
 TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
-# Minimum time between two drawn markers, as a fraction of the segment
-MIN_MARK_DISTANCE = 1.0 / 300.0
+# Minimum time between two drawn event markers, as a fraction of the analysed time span
+MIN_MARK_INTERVAL_FRACTION = 1.0 / 300.0
 
 
 class Mark(NamedTuple):
@@ -37,13 +39,13 @@ class Mark(NamedTuple):
     height: float | None = None
 
 
-def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
+def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
     events = analysis.events
     return (
         Mark("on the ground", events.ground, GROUND_BAND),
         Mark("gap in position source", events.gaps, GAP_BAND),
         Mark("log dropout", events.dropouts, DROPOUT_BAND),
-        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, 0.025),
+        Mark("EKF2 rejected", rejected_s, REJECTED_DOTS, 0.025),
         Mark("outlier", outlier_times(analysis), OUTLIER_MARK, 0.075),
         Mark("EKF2 reset", events.resets_s, RESET_MARK, 0.92),
         Mark("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
@@ -62,7 +64,7 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
     segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
-    marks = _marks(analysis, analysis.events.rejected_s.get(name, ()))
+    marks = _event_marks(analysis, analysis.events.rejected_s.get(name, ()))
     for order, (_, spans_or_times, style, height) in enumerate(marks, start=1):
         if not len(spans_or_times):
             continue
@@ -71,11 +73,11 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            times = visible_times(
-                spans_or_times, MIN_MARK_DISTANCE * (segment.end_s - segment.start_s)
+            visible_times_s = visible_times(
+                spans_or_times, MIN_MARK_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
             )
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
-            markers = Line2D(times, np.full(len(times), height), **mark_style)
+            markers = Line2D(visible_times_s, np.full(len(visible_times_s), height), **mark_style)
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
 
 
@@ -117,13 +119,13 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     rejected_s = [time for times in analysis.events.rejected_s.values() for time in times]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, spans_or_times, style, height in _marks(analysis, rejected_s)
+        for label, spans_or_times, style, height in _event_marks(analysis, rejected_s)
         if len(spans_or_times)
     ]
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
     """Return the first time (s) of each interval, so that markers do not overlap."""
-    values = np.asarray(times, dtype=np.float64)
-    visible_s: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
+    times_s = np.asarray(times, dtype=np.float64)
+    visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
     return visible_s

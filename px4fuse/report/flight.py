@@ -16,7 +16,7 @@ from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATES = 15  # number of updates in the plot of a few updates
+ZOOM_UPDATE_COUNT = 15  # number of updates in the plot of a few updates
 MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of a few updates
 ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of a few updates
 
@@ -48,13 +48,13 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
     """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
     result = analysis.main
-    start_s, end_s = window = zoom_window(result, analysis.segment)
+    start_s, end_s = zoom_span_s = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.panel(title, zoom_sentence(result), ZOOM_HEIGHT)
-    _draw_sawtooth(axes, result, window)
-    updates = result.replay.updates.loc[start_s:end_s].index
+    _draw_sawtooth(axes, result, zoom_span_s)
+    update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
-        updates,
+        update_times_s,
         0.0,
         0.03,
         transform=axes.get_xaxis_transform(),
@@ -62,36 +62,45 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
         lw=1.2,
     )
     axes.set_xlabel(style.TIME_LABEL)
-    symbols = ""
+    ekf2_legend = ""
     if not isinstance(result.ekf2_state, Unavailable):
-        symbols = " EKF2: ▵ before and ▾ after an update, □ logged σ."
-    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{symbols}")
+        ekf2_legend = " EKF2: ▵ before and ▾ after an update, □ logged σ."
+    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     """Return start and end (s) of the plot of a few updates in the middle of the flight."""
-    times = result.replay.updates.index.to_numpy()
-    if len(times) < 2:
+    update_times_s = result.replay.updates.index.to_numpy()
+    if len(update_times_s) < 2:
         return segment.start_s, min(segment.start_s + MIN_ZOOM_S, segment.end_s)
-    interval = float(np.median(np.diff(times)))
-    count = min(max(ZOOM_UPDATES, round(MIN_ZOOM_S / interval)), len(times) - 1)
-    spans = times[count:] - times[:-count]
-    middle_s = float(times[len(times) // 2])
+    interval_s = float(np.median(np.diff(update_times_s)))
+    update_count = min(
+        max(ZOOM_UPDATE_COUNT, round(MIN_ZOOM_S / interval_s)), len(update_times_s) - 1
+    )
+    durations_s = update_times_s[update_count:] - update_times_s[:-update_count]
+    middle_s = float(update_times_s[len(update_times_s) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
         middle_s = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
-    nearest_row = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle_s))
-    return float(times[nearest_row]), float(times[nearest_row + count])
+    nearest_row = np.argmin(np.abs(update_times_s[:-update_count] + durations_s / 2.0 - middle_s))
+    return float(update_times_s[nearest_row]), float(update_times_s[nearest_row + update_count])
 
 
-def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
+def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
-    prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
+    prior_variance_m2, posterior_variance_m2 = (
+        updates["prior_position_variance_m2"],
+        steps["position_variance_m2"],
+    )
     # a stable sort keeps the prior variance before the posterior variance of the same update
-    variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
+    variances_m2 = (
+        pd.concat([prior_variance_m2, posterior_variance_m2])
+        .sort_index(kind="stable")
+        .loc[slice(*zoom_span_s)]
+    )
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
-    axes.plot(variances.index, np.sqrt(variances), **dots)
+    axes.plot(variances_m2.index, np.sqrt(variances_m2), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
+        ekf2 = result.ekf2_innovations.loc[slice(*zoom_span_s)].dropna(subset=["prior_variance_m2"])
         sigma_before, sigma_after = (
             np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior")
         )
@@ -99,13 +108,15 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
         axes.plot(sigma_before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
         axes.plot(sigma_after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        logged_sigma = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
+        logged_sigma = np.sqrt(
+            result.ekf2_variance["position_variance_m2"].loc[slice(*zoom_span_s)]
+        )
         axes.plot(logged_sigma, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
-    axes.set_xlim(*window)
+    axes.set_xlim(*zoom_span_s)
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    texts = []
+    filter_texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
             filter_summary.sigma_p_before_update_m,
@@ -113,19 +124,21 @@ def zoom_sentence(result: AxisComparison) -> str:
         )
         if prior_m is None or posterior_m is None:
             if name == "EKF2":
-                texts.append(
+                filter_texts.append(
                     "σ of EKF2 before and after an update is unknown: S or R is not logged"
                 )
             continue
-        reduction = 1.0 - posterior_m**2 / prior_m**2
-        change_text = f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {reduction:.0%} less variance"
+        variance_reduction = 1.0 - posterior_m**2 / prior_m**2
+        change_text = (
+            f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {variance_reduction:.0%} less variance"
+        )
         if name == "KF":
             change_text = (
                 f"σ grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} "
                 f"m/s²) and decreases with each measurement ({change_text})"
             )
-        texts.append(change_text)
-    return f"{'; '.join(texts)}." if texts else ""
+        filter_texts.append(change_text)
+    return f"{'; '.join(filter_texts)}." if filter_texts else ""
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:

@@ -12,7 +12,7 @@ from matplotlib.font_manager import FontEntry, FontPath
 # Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 # Words in the names of fonts that draw a box for every character
-BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
+BOX_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
 MAX_LISTED_CHARACTERS = 12
 
@@ -74,14 +74,16 @@ def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
     entries = [
         entry
         for entry in manager.ttflist
-        if entry.style == "normal" and not any(word in entry.name.lower() for word in BOX_FONTS)
+        if entry.style == "normal"
+        and not any(word in entry.name.lower() for word in BOX_FONT_WORDS)
     ]
     return tuple(
-        (entry.name, FontPath(entry.fname, entry.index)) for entry in sorted(entries, key=_sort_key)
+        (entry.name, FontPath(entry.fname, entry.index))
+        for entry in sorted(entries, key=_font_sort_key)
     )
 
 
-def _sort_key(entry: FontEntry) -> tuple[object, ...]:
+def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
     """Return the sort key: Noto Sans first, then sans serif, then regular weight; PostScript last.
 
     PostScript outlines are embedded as TrueType, which some PDF viewers do not display.

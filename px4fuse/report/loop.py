@@ -16,7 +16,14 @@ from px4fuse.report import style
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
+from px4fuse.report.style import (
+    EKF2_COLOUR,
+    KF_COLOUR,
+    MUTED_COLOUR,
+    TRACK_LINES,
+    Axes,
+    set_map_axes,
+)
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
@@ -24,16 +31,16 @@ from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import Interval, Statistics
 
-LEAD = (
+LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
     "correction distributes it along the path: by distance (positions only as in Example 2 of "
     "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
     "tested first, because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
-RED = style.SEVERITY_COLOURS["error"]
+ERROR_COLOUR = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED_LABEL: LINES["EKF2"],
+    corrections.UNCORRECTED_LABEL: TRACK_LINES["EKF2"],
     corrections.POSITIONS_CORRECTED_LABEL: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
     corrections.HEADINGS_CORRECTED_LABEL: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
     SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
@@ -47,7 +54,7 @@ TRACK_KINDS = {
     "slam": "SLAM trajectory",
     "unknown": "trajectory of unknown kind",
 }
-CLOSURE_HEAD = (
+CLOSURE_TABLE_HEAD = (
     "closure",
     "distance\n(m)",
     "d²",
@@ -63,14 +70,14 @@ MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix_title(TITLE), LEAD)
+        page = Page(appendix_title(TITLE), LEAD_TEXT)
         _write_page(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the page of ``px4fuse loop``, with its findings."""
-    page = Page(TITLE, LEAD)
+    page = Page(TITLE, LEAD_TEXT)
     if student := student_line(results.student, ", "):
         page.write_labelled("Student", student)
     page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
@@ -95,27 +102,27 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 def draw_map(axes: Axes, loop: Loop) -> None:
     """Draw the uncorrected and corrected paths from above, with the closure error as an arrow."""
-    path = loop.odometry.trajectory
-    names = AXES_OF_FRAME[path.frame]
+    odometry_path = loop.odometry.trajectory
+    axis_names = AXES_OF_FRAME[odometry_path.frame]
     _draw_reference(axes, loop)
     for corrected_path in loop.reported_paths:
         track, name = corrected_path.trajectory, corrected_path.name
         if name in PATH_STYLES:
             horizontal_m = track.position_m[:, (1, 0)]
             plot_path(axes, horizontal_m, track.time_s, label=name, **PATH_STYLES[name])
-    start, end = path.position_m[[0, -1]][:, (1, 0)]
+    start, end = odometry_path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
         *end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label="end of odometry", zorder=5
     )
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
-        arrow = {"arrowstyle": "->", "color": RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
+        arrow = {"arrowstyle": "->", "color": ERROR_COLOUR, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
         axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow)
         label = f"closure error {loop.closure_error_m:.2f} m"
-        axes.plot([], [], color=RED, lw=1.2, label=label)
-        axes.plot(*true_end, "x", color=RED, ms=5, mew=1.2, zorder=6, label="true end")
-    set_map_axes(axes, names[1], names[0])
+        axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
+        axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
+    set_map_axes(axes, axis_names[1], axis_names[0])
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
@@ -129,13 +136,13 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
                 reference_m,
                 score.time_s,
                 label=reference.name,
-                **LINES["ground truth"],
+                **TRACK_LINES["ground truth"],
                 zorder=4,
             )
 
 
 def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal page of a loop: closure error, corrected paths and findings."""
+    """Make the terminal output on a loop: closure error, corrected paths and findings."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -161,18 +168,26 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     for closure in loop.closures[:1]:
         page.write_labelled("Gate", describe_gate(closure))
     single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
-    for text in (by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)):
+    for text in (
+        correction_by_distance_sentence(loop),
+        single_loop_note,
+        *missing_corrections(loop),
+    ):
         page.write(text, colour=MUTED_COLOUR, above=2.0)
     for group in group_by_root(findings):
         write_finding(page, group)
-    names = [reference.name for reference in loop.references]
+    reference_names = [reference.name for reference in loop.references]
     page.table(
-        ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)],
+        [
+            "path",
+            "correction\nRMS / max (m)",
+            *(f"ATE against\n{name} (m)" for name in reference_names),
+        ],
         [
             [
                 corrected_path.name,
                 format_correction(corrected_path),
-                *(_format_ate(corrected_path.scores[name]) for name in names),
+                *(_format_ate(corrected_path.scores[name]) for name in reference_names),
             ]
             for corrected_path in loop.reported_paths
         ],
@@ -180,7 +195,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.write_small(
         "ATE: position RMSE after alignment, with its 95 % interval (block "
         "bootstrap) if the flight is long enough."
-        if names
+        if reference_names
         else (
             "The error of the path is unknown without ground truth or reference "
             "trajectory. Add a reference trajectory with --reference FILE."
@@ -201,10 +216,10 @@ def write_scores(page: Page, loop: Loop) -> None:
             "accepted" if closure.accepted else "REJECTED",
             "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
-        colour = "black" if closure.accepted else RED
+        colour = "black" if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
+        page.table(CLOSURE_TABLE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         scores = {
             corrected_path.name: corrected_path.scores[reference.name]
@@ -222,13 +237,13 @@ def write_scores(page: Page, loop: Loop) -> None:
         if not evaluations:
             continue
         first_evaluation = next(iter(evaluations.values()))
-        head = [
+        table_head = [
             "path",
             *(f"{error.delta_text} (m)" for error in first_evaluation.rpe),
             "rotation (°)",
         ]
         page.table(
-            head,
+            table_head,
             [
                 [
                     name,
@@ -284,28 +299,30 @@ def closure_name(closure: Closure, loop: Loop) -> str:
     return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
 
 
-def by_distance_sentence(loop: Loop) -> str:
+def correction_by_distance_sentence(loop: Loop) -> str:
     """Explain the correction of the path in proportion to distance; "" if it was not made."""
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "The correction with headings also distributes the heading error along the path."
+    heading_sentence = (
+        "The correction with headings also distributes the heading error along the path."
+    )
     if isinstance(heading_deg, Unavailable):
-        headings = f"The headings are not corrected: {heading_deg.reason}."
+        heading_sentence = f"The headings are not corrected: {heading_deg.reason}."
     return (
         "The correction by distance shifts each position by a part of the closure error that is "
         "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
-        f"{headings}"
+        f"{heading_sentence}"
     )
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    unavailable = [
+    unavailable_corrections = [
         correction
         for correction in loop.corrections.values()
         if isinstance(correction, Unavailable)
     ]
-    reasons = [f"{correction.what}: {correction.reason}" for correction in unavailable]
+    reasons = [f"{correction.what}: {correction.reason}" for correction in unavailable_corrections]
     return [reason for reason in dict.fromkeys(reasons) if SINGLE_LOOP_REASON not in reason]
 
 
@@ -331,7 +348,7 @@ def format_correction(correction: CorrectedPath) -> str:
 
 
 def graph_summary(solved_graph: Graph) -> Page:
-    """Make the terminal page of a pose graph: tested closures, solver and costs."""
+    """Make the terminal output on a pose graph: tested closures, solver and costs."""
     page = Page()
     page.write_labelled(
         "Graph",
@@ -345,8 +362,11 @@ def graph_summary(solved_graph: Graph) -> Page:
         page.write_labelled("Gate", "the graph has no loop closures to test")
     else:
         rejected_gates = [gate for gate in gates if not gate.accepted]
-        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected_gates]
-        listed_closures = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
+        gate_texts = [
+            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
+            for gate in rejected_gates
+        ]
+        listed_closures = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
         page.write_labelled(
             "Gate",
             f"{len(rejected_gates)} of {len(gates)} loop closures rejected",
@@ -357,12 +377,13 @@ def graph_summary(solved_graph: Graph) -> Page:
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
-    unconverged = [
+    unconverged_solutions = [
         SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged
     ]
-    if unconverged:
+    if unconverged_solutions:
         page.write_labelled(
-            "Solver", f"not converged: {', '.join(unconverged)}. The cost is not at its minimum."
+            "Solver",
+            f"not converged: {', '.join(unconverged_solutions)}. The cost is not at its minimum.",
         )
     rows = [
         [

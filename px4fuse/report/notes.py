@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # indent (points) of each list level
 MAX_INDENTS = 8  # maximum number of indents of a text
-# Maximum depth of nested Markdown: each level needs three of Python's 1000 stack levels
-MAX_NESTING = 100
+# Maximum depth of nested Markdown: each level needs three levels of Python's stack of 1000
+MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
@@ -61,7 +61,7 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     Raises
     ------
     SettingsError
-        Emphasis, lists and quotes are nested deeper than :data:`MAX_NESTING`.
+        Emphasis, lists and quotes are nested deeper than :data:`MAX_NESTING_DEPTH`.
     """
     # imported here, because reports without notes do not need it (20 ms)
     from markdown_it import MarkdownIt  # noqa: PLC0415
@@ -72,10 +72,10 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
         nested_token for token in tokens for nested_token in (token, *(token.children or ()))
     )
     depth = max(accumulate(token.nesting for token in all_tokens), default=0)
-    if depth > MAX_NESTING:
+    if depth > MAX_NESTING_DEPTH:
         raise SettingsError(
             f"{name}: emphasis, lists and quotes are nested {depth} levels deep; at most "
-            f"{MAX_NESTING} levels are allowed",
+            f"{MAX_NESTING_DEPTH} levels are allowed",
             "Remove repeated * and _.",
         )
     return tokens
@@ -106,8 +106,8 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
                 page.write(code, colour=MUTED_COLOUR, indent=indent + INDENT)
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
-                head, *body = ([_inline_text(cell) for cell in row] for row in rows)
-                page.table(head, body, column_widths=[1.0] * len(head))
+                head, *body_rows = ([_inline_text(cell) for cell in row] for row in rows)
+                page.table(head, body_rows, column_widths=[1.0] * len(head))
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraphs; a horizontal rule has no text

@@ -18,8 +18,8 @@ COLUMN_GAP = 5.0 * 72.0 / 25.4  # gap (points) between two columns
 LABEL_WIDTH = 52.0  # width (points) of the labels of texts
 AXIS_LEFT = 30.0  # width (points) for the tick labels left of the axes
 AXES_RIGHT = 8.0  # margin (points) right of the axes
-LEGEND_LINE = 12.0  # height (points) of one line of a legend
-LEGEND_HANDLE = 30.0  # width (points) of the line sample and the gaps of a legend entry
+LEGEND_LINE_HEIGHT = 12.0  # height (points) of one line of a legend
+LEGEND_HANDLE_WIDTH = 30.0  # width (points) of the line sample and the gaps of a legend entry
 TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
 AXIS_LABEL_HEIGHT = 12.5  # height (points) of the axis label below the tick labels
 UNLABELLED_HEIGHT = 3.0  # height (points) below axes without tick labels
@@ -133,12 +133,12 @@ class Page:
         axes.locator_params(axis="x", nbins=8)
         axes.locator_params(axis="y", nbins=4)
         margins = left, right, above
-        alt = ": ".join(filter(None, (title, caption)))
+        alternative_text = ": ".join(filter(None, (title, caption)))
         block = self.add(
             "panel",
             title=title,
             caption=caption,
-            alt=alt,
+            alt=alternative_text,
             axes=axes,
             margins=margins,
             height=height,
@@ -155,13 +155,13 @@ class Page:
         rows: list[list[Artist]] = [[]]
         free_width = self.width
         for entry in entries:
-            width = text_width(str(entry.get_label())) + LEGEND_HANDLE
+            width = text_width(str(entry.get_label())) + LEGEND_HANDLE_WIDTH
             if rows[-1] and width > free_width:
                 rows.append([])
                 free_width = self.width
             rows[-1].append(entry)
             free_width -= width
-        height = LEGEND_LINE * len(rows)
+        height = LEGEND_LINE_HEIGHT * len(rows)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
         for row_index, row in enumerate(rows):
             figure.legend(
@@ -176,12 +176,12 @@ class Page:
                 columnspacing=1.2,
             )
         labels = ", ".join(str(artist.get_label()) for row in rows for artist in row)
-        alt = f"Legend: {labels}"
+        alternative_text = f"Legend: {labels}"
         return self.add(
             "panel",
             title="",
             caption="",
-            alt=alt,
+            alt=alternative_text,
             width=self.width,
             height=height,
             figure=figure,
@@ -193,7 +193,7 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
 
 
-def halves(left_fraction: float = 0.5) -> tuple[Page, Page]:
+def two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
     """Return a left and a right column that fill the page."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)

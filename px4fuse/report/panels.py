@@ -17,8 +17,8 @@ from px4fuse.report import event_marks, style
 from px4fuse.report.page import Block, Page
 from px4fuse.report.phrases import filters_by_name, format_verdict
 from px4fuse.report.style import (
-    DOTS,
-    LINES,
+    INNOVATION_DOTS,
+    TRACK_LINES,
     Artist,
     Axes,
     draw_curve,
@@ -27,10 +27,10 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Margin factor of the axis of innovations
-EDGE_FACTOR = 1.3
-# Maximum limit (in √S) of the axis of innovations
-MAX_EDGE_SIGMAS = 5.0
+# Ratio of the limit of the innovation plot to the largest drawn innovation, for a margin
+INNOVATION_AXIS_MARGIN_FACTOR = 1.3
+# Maximum limit (in √S) of the innovation plot, without the margin
+MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
@@ -99,12 +99,12 @@ def add_legend(page: Page, analysis: Analysis) -> Block:
     result = analysis.main
     lines: list[Artist] = [
         Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="position"),
-        Line2D([], [], **LINES["KF"], label="KF"),
+        Line2D([], [], **TRACK_LINES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
     ]
     for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
         if isinstance(track, pd.DataFrame):
-            lines.append(Line2D([], [], **LINES[name], label=name))
+            lines.append(Line2D([], [], **TRACK_LINES[name], label=name))
     return page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
@@ -118,13 +118,13 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     drawn_series = [kf_values]
     for track, name in ((result.ekf2_state, "EKF2"), (result.truth, "ground truth")):
         if isinstance(track, pd.DataFrame) and track[quantity.column].notna().any():
-            draw_curve(axes, track[quantity.column], **LINES[name], zorder=2.5)
+            draw_curve(axes, track[quantity.column], **TRACK_LINES[name], zorder=2.5)
             drawn_series.append(track[quantity.column])
-    draw_curve(axes, kf_values, **LINES["KF"])
+    draw_curve(axes, kf_values, **TRACK_LINES["KF"])
     # the ±2σ band is very wide in the first second, so the axis is scaled to the tracks
     all_values = pd.concat(drawn_series)
-    pad = 0.08 * (all_values.max() - all_values.min()) + 1e-3
-    axes.set_ylim(all_values.min() - pad, all_values.max() + pad)
+    margin = 0.08 * (all_values.max() - all_values.min()) + 1e-3
+    axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
 
 def _position_sentence(_: Analysis, result: AxisComparison) -> str:
@@ -132,18 +132,20 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
     return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
 
-def _error_numbers(result: AxisComparison, quantity: Quantity) -> list[str]:
-    values = {
+def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
+    rmse_by_filter = {
         name: getattr(filter_summary.truth, quantity.rmse, None)
         for name, filter_summary in filters_by_name(result).items()
     }
-    errors = [
-        f"{name} {error:.3f} {quantity.unit}" for name, error in values.items() if error is not None
+    rmse_texts = [
+        f"{name} {rmse:.3f} {quantity.unit}"
+        for name, rmse in rmse_by_filter.items()
+        if rmse is not None
     ]
-    return [f"RMSE against ground truth {', '.join(errors)}"] if errors else []
+    return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
 
-def _position_numbers(result: AxisComparison) -> str:
+def _position_difference_text(result: AxisComparison) -> str:
     difference = result.difference
     text = (
         f"{difference.what}: {difference.reason}"
@@ -151,27 +153,30 @@ def _position_numbers(result: AxisComparison) -> str:
         else f"KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
         f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
     )
-    return "; ".join([*_error_numbers(result, POSITIONS), text])
+    return "; ".join([*_rmse_texts(result, POSITIONS), text])
 
 
-def _velocity_numbers(result: AxisComparison) -> str:
-    texts = _error_numbers(result, VELOCITIES)
+def _velocity_difference_text(result: AxisComparison) -> str:
+    texts = _rmse_texts(result, VELOCITIES)
     if isinstance(result.difference, Difference):
         texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(texts)
 
 
-def _axis_half_height(result: AxisComparison) -> float:
-    half_heights_m = []
+def _innovation_axis_limit_m(result: AxisComparison) -> float:
+    innovation_limits_m = []
     for innovations in (result.replay.updates, result.ekf2_innovations):
         if isinstance(innovations, pd.DataFrame):
-            median_sigma = float(np.sqrt(innovations["innovation_variance_m2"].median()))
+            median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
             # a quantile, so that outliers do not enlarge the axis
             quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-            half_heights_m.append(
-                max(2.0 * median_sigma, min(quantile_m, MAX_EDGE_SIGMAS * median_sigma))
+            innovation_limits_m.append(
+                max(
+                    2.0 * median_sqrt_s_m,
+                    min(quantile_m, MAX_INNOVATION_AXIS_SIGMAS * median_sqrt_s_m),
+                )
             )
-    return EDGE_FACTOR * max(half_heights_m)
+    return INNOVATION_AXIS_MARGIN_FACTOR * max(innovation_limits_m)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
@@ -199,55 +204,57 @@ def draw_dots(
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
-    half_height, ekf2_innovations = _axis_half_height(result), result.ekf2_innovations
+    axis_limit_m, ekf2_innovations = _innovation_axis_limit_m(result), result.ekf2_innovations
     updates = result.replay.updates
     kf_innovations = updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
-    dots = [(kf_innovations, DOTS["KF"])]
+    innovations_and_styles = [(kf_innovations, INNOVATION_DOTS["KF"])]
     if isinstance(ekf2_innovations, pd.DataFrame):
         two_sigma = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
         for side in (two_sigma, -two_sigma):
-            draw_curve(axes, side, **LINES["EKF2"])
+            draw_curve(axes, side, **TRACK_LINES["EKF2"])
         is_rejected = ekf2_innovations["rejected"] > 0
         innovations = ekf2_innovations["innovation_m"]
-        dots = [
-            (innovations[~is_rejected], DOTS["EKF2"]),
-            (innovations[is_rejected], style.EKF2_REJECTED),
-            *dots,
+        innovations_and_styles = [
+            (innovations[~is_rejected], INNOVATION_DOTS["EKF2"]),
+            (innovations[is_rejected], style.REJECTED_DOTS),
+            *innovations_and_styles,
         ]
-    for values, marker_style in dots:
-        draw_dots(axes, values, half_height, marker_style)
-    axes.set_ylim(-1.04 * half_height, 1.04 * half_height)
+    for values, marker_style in innovations_and_styles:
+        draw_dots(axes, values, axis_limit_m, marker_style)
+    axes.set_ylim(-1.04 * axis_limit_m, 1.04 * axis_limit_m)
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
-    half_height, sentences = _axis_half_height(result), []
+    axis_limit_m, sentences = _innovation_axis_limit_m(result), []
     innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
-        table = innovation_tables[name]
-        assert isinstance(table, pd.DataFrame)
-        outside_count = int((table["innovation_m"].abs() > half_height).sum())
-        outside = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
+        innovations = innovation_tables[name]
+        assert isinstance(innovations, pd.DataFrame)
+        outside_count = int((innovations["innovation_m"].abs() > axis_limit_m).sum())
+        outside_text = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m"
-            f"{outside}."
+            f"{outside_text}."
         )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
     elif isinstance(result.ekf2_innovations, pd.DataFrame):
-        count = int((result.ekf2_innovations["rejected"] > 0).sum())
-        sentences += [f"EKF2 rejected {count} positions (hollow dots)."] if count else []
+        rejected_count = int((result.ekf2_innovations["rejected"] > 0).sum())
+        sentences += (
+            [f"EKF2 rejected {rejected_count} positions (hollow dots)."] if rejected_count else []
+        )
     return " ".join(sentences)
 
 
-def _innovation_numbers(result: AxisComparison) -> str:
+def _fraction_outside_text(result: AxisComparison) -> str:
     fractions = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
         for name, consistency in filters_by_name(result).items()
@@ -259,7 +266,7 @@ def _innovation_numbers(result: AxisComparison) -> str:
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     for variance, name in ((result.replay.steps, "KF"), (result.ekf2_variance, "EKF2")):
         if isinstance(variance, pd.DataFrame):
-            draw_curve(axes, np.sqrt(variance[quantity.variance]), **LINES[name])
+            draw_curve(axes, np.sqrt(variance[quantity.variance]), **TRACK_LINES[name])
     set_log_scale(axes)
 
 
@@ -267,22 +274,25 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     """Return the caption of the σ plot: growth of σ in the longest gap of the position source."""
     if not analysis.events.gaps:
         return ""
-    start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
+    start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     largest_sigmas = {
-        name: float(np.sqrt(variance.loc[start:end, "position_variance_m2"].max()))
+        name: float(np.sqrt(variance.loc[start_s:end_s, "position_variance_m2"].max()))
         for name, variance in (
             ("KF", result.replay.steps),
             ("EKF2", result.in_flight.ekf2_variance),
         )
-        if isinstance(variance, pd.DataFrame) and len(variance.loc[start:end]) > 1
+        if isinstance(variance, pd.DataFrame) and len(variance.loc[start_s:end_s]) > 1
     }
-    growth = " and ".join(
+    sigma_texts = " and ".join(
         f"{sigma:.2g} m ({name})" for name, sigma in largest_sigmas.items() if np.isfinite(sigma)
     )
-    return growth and f"In the gap of {end - start:.1f} s from {start:.0f} s, σ grew to {growth}."
+    return (
+        sigma_texts
+        and f"In the gap of {end_s - start_s:.1f} s from {start_s:.0f} s, σ grew to {sigma_texts}."
+    )
 
 
-def _median_text(result: AxisComparison, quantity: Quantity) -> str:
+def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
     medians = {
         name: getattr(filter_summary, quantity.sigma)
         for name, filter_summary in filters_by_name(result).items()
@@ -299,33 +309,33 @@ POSITION = Panel(
     150.0,
     partial(draw_tracks, quantity=POSITIONS),
     _position_sentence,
-    _position_numbers,
+    _position_difference_text,
 )
 VELOCITY = Panel(
     "Velocity (m/s)",
     150.0,
     partial(draw_tracks, quantity=VELOCITIES),
     lambda *_: "Velocity is not measured: each filter estimates it from positions and IMU.",
-    _velocity_numbers,
+    _velocity_difference_text,
 )
 INNOVATIONS = Panel(
     "Innovations (m)",
     140.0,
     draw_innovations,
     innovation_sentence,
-    _innovation_numbers,
+    _fraction_outside_text,
 )
 SIGMA_P = Panel(
     "σ of position (m), log scale",
     80.0,
     partial(_draw_sigma, quantity=POSITIONS),
     sigma_sentence,
-    partial(_median_text, quantity=POSITIONS),
+    partial(_median_sigma_text, quantity=POSITIONS),
 )
 SIGMA_V = Panel(
     "σ of velocity (m/s), log scale",
     60.0,
     partial(_draw_sigma, quantity=VELOCITIES),
     lambda *_: "",
-    partial(_median_text, quantity=VELOCITIES),
+    partial(_median_sigma_text, quantity=VELOCITIES),
 )

@@ -27,7 +27,7 @@ from px4fuse.results import contract
 from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
-# Drawing functions of the pages, in order, by type of results
+# Functions that draw the pages of a report, in their order, by type of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
         cover.draw,

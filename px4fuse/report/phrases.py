@@ -32,20 +32,22 @@ if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
-# Maximum p value of the Ljung-Box test for a note that innovations are not white: with eight tests
-# per flight, less than 1 % of flights have a false alarm
-MIN_WHITE_P = 0.001
-# Size of the reported σ for each verdict
-SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
+# Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
+# than 1 % of the flights have a false alarm
+MIN_WHITE_P_VALUE = 0.001
+# Size of the reported σ compared with the actual σ, by verdict
+SIGMA_SIZES = {"underconfident": "too large", "overconfident": "too small"}
 RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def format_settings(settings: Settings) -> str:
-    offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
+    offset_text = (
+        f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
+    )
     return (
         f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
-        f"DT {settings.dt_s:g} s, input {settings.input}{offset}"
+        f"DT {settings.dt_s:g} s, input {settings.input}{offset_text}"
     )
 
 
@@ -62,9 +64,9 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
-    if verdict not in SIGMA_VERDICTS:
+    if verdict not in SIGMA_SIZES:
         return verdict
-    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_SIZES[verdict]}"
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
@@ -75,7 +77,7 @@ def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unteste
     return filters
 
 
-VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
+VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def verdict_rows(
@@ -87,9 +89,9 @@ def verdict_rows(
     for result in axes:
         for name, consistency in filters_by_name(result).items():
             label = result.axis.label.removeprefix("the ") if name == "KF" else ""
-            nis, colour = ("", ""), MUTED_COLOUR
+            nis_cells, colour = ("", ""), MUTED_COLOUR
             if isinstance(consistency, Consistency):
-                nis = (
+                nis_cells = (
                     format_number(consistency.nis_mean),
                     "{:.2f} – {:.2f}".format(*consistency.nis_band),
                 )
@@ -102,7 +104,7 @@ def verdict_rows(
                 [
                     label,
                     name,
-                    *nis,
+                    *nis_cells,
                     (format_verdict(consistency), colour),
                     *extra_cells(result, name, consistency),
                 ]
@@ -123,7 +125,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
         cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
         return cells + [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
 
-    head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
+    head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
     page.table(head, verdict_rows(axes, rms_cells), right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
@@ -147,17 +149,17 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
-    correlated = [
+    correlated_filters = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
-        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P
+        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
     ]
-    if correlated:
+    if correlated_filters:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P:g}): {'; '.join(correlated)}. If the autocorrelation is positive, the "
-            "filter lags and SIGMA_A may be too small. If it is negative, the filter follows the "
-            "measurement noise and SIGMA_A may be too large."
+            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filters)}. If the autocorrelation is "
+            "positive, the filter lags and SIGMA_A may be too small. If it is negative, the filter "
+            "follows the measurement noise and SIGMA_A may be too large."
         )
     return notes
 
@@ -175,18 +177,18 @@ def format_clock_map(clock: ClockMap) -> str:
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight; labels are the keys."""
     north, east, down = alignment.origin_m
-    yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma = "" if sigma is None else f" ± {sigma:.3f} s"
+    yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
+    clock_sigma_s, residual_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
     texts = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
-        "yaw": f"{alignment.yaw_deg:.2f}°{yaw} ({alignment.yaw_reason})",
+        "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
         "origin": f"north {north:.3f} m, east {east:.3f} m, down {down:.3f} m",
-        "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma} to the boot clock "
+        "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma_text} to the boot clock "
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        residual_text = "" if residual is None else f", {residual:.3f} m RMS per axis"
+        residual_text = "" if residual_m is None else f", {residual_m:.3f} m RMS per axis"
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         texts["match"] = correlation_text + residual_text
     return texts
@@ -197,48 +199,52 @@ def tuning_advice(
 ) -> dict[str, str]:
     """Return the recommended actions after noise estimation, with their labels as keys."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
-    axis = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
-    tuning = tuning_by_axis.get(axis)
+    axis_name = next(
+        (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
+    )
+    tuning = tuning_by_axis.get(axis_name)
     if not isinstance(tuning, AxisTuning):
         return {}
     advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
-    drifts, log = comparison.source.origin.may_drift, comparison.flight.log
-    if drifts:
+    may_drift, log = comparison.source.origin.may_drift, comparison.flight.log
+    if may_drift:
         advice["Drift"] = (
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
-    options = [
+    option_texts = [
         f" {option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", sigma_a), ("--sigma-z", sigma_z))
-        if noise.value is not None and not drifts
+        if noise.value is not None and not may_drift
     ]
-    if options:
-        command = f"px4fuse compare LOG{''.join(options)}"
-        advice["Action"] = f"Re-run with the estimates of {axis}: {command}"
+    if option_texts:
+        command = f"px4fuse compare LOG{''.join(option_texts)}"
+        advice["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m. Check that the source measures positions."
         )
     elif sigma_z.value is None:
-        bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
+        bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
-            f"SIGMA_Z cannot be estimated at this logging rate{bound}: it is masked by the process "
-            "noise between samples. Log the source at a higher rate."
+            f"SIGMA_Z cannot be estimated at this logging rate{bound_text}: it is masked by the "
+            "process noise between samples. Log the source at a higher rate."
         )
-    elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
+    elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
         flown_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
         variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
         reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
         changes = noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
-        current_value = "" if flown_m is None else f" (now {flown_m:g} m)"
-        advice["PX4"] = f"Set {name} to {changes[name]:g} m{current_value}."
-        is_within = flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (sigma_z.high or 0.0)
+        flown_text = "" if flown_m is None else f" (now {flown_m:g} m)"
+        advice["PX4"] = f"Set {name} to {changes[name]:g} m{flown_text}."
+        is_flown_within_interval = flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (
+            sigma_z.high or 0.0
+        )
         if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
             advice["PX4"] = (
                 f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
             )
-        elif is_within:
+        elif is_flown_within_interval:
             advice["PX4"] = f"{name} {flown_m:g} m is within the 95 % interval."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
@@ -251,16 +257,17 @@ def tuning_advice(
         tuning.biases_fitted
         and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
     ):
-        bound = "" if tuning.sigma_a.value is not None else "at most "
+        bound_text = "" if tuning.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound}{accelerometer_noise:.2g} m/s². KF has no state "
-            "for accelerometer bias and tilt error. To include both, SIGMA_A must be "
+            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². KF has no "
+            "state for accelerometer bias and tilt error. To include both, SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
     if len(tuning.outlier_time_s):
         advice["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis}) are outliers, "
-            f"the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude them."
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis_name}) are "
+            f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
+            "them."
         )
     return advice
 
@@ -277,14 +284,14 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
-    finding, *consequences = group
+    finding, *effects = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
         texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
-    if consequences:
-        titles = " ".join(f"{finding.title} [{finding.id}]." for finding in consequences)
-        texts.append(styled_text(f"Consequences: {titles}", 8.0, MUTED_COLOUR))
+    if effects:
+        effect_titles = " ".join(f"{finding.title} [{finding.id}]." for finding in effects)
+        texts.append(styled_text(f"Consequences: {effect_titles}", 8.0, MUTED_COLOUR))
     page.write_labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,

@@ -28,7 +28,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     _write_section(
         page,
         f"Time offset between {source.name} and the IMU",
-        plain_texts=[clock.summary_line(analysis, results.findings)],
+        plain_texts=[clock.summarise_offset(analysis, results.findings)],
     )
     if alignment is not None:
         _write_section(page, f"Alignment of {source.name}", describe_alignment(alignment).items())
@@ -58,28 +58,33 @@ def _findings_page(results: ComparisonResults | AidsResults) -> Page:
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    log, facts = flight.log, dict[str, str]()
+    log, facts_by_label = flight.log, dict[str, str]()
     other_positions = (
-        f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source
+        f"{track.name} ({track.rate_hz:.1f} Hz)"
+        for track in flight.positions
+        if track is not source
     )
     if source is not None:
-        facts["position source"] = (
+        facts_by_label["position source"] = (
             f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
-    facts = {
+    facts_by_label = {
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
         "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
-        **facts,
+        **facts_by_label,
         "other positions": ", ".join(other_positions) or "none",
         "parameters": ", ".join(parameters) or "none",
-        **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
+        **{
+            file.role: f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
+            for file in flight.inputs
+        },
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
         "SHA-256": log.sha256,
     }
     section = Page()
-    _write_section(section, "Log", facts.items())
+    _write_section(section, "Log", facts_by_label.items())
     page.add_columns(section)  # Typst does not split a column between pages
 
 
@@ -97,7 +102,10 @@ def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the provenance of ``px4fuse loop``."""
     page = Page("Provenance")
-    tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
+    tracks = [
+        ("track", loop.odometry.trajectory),
+        *(("reference", reference) for reference in loop.references),
+    ]
     file_facts = [
         (
             label,

@@ -15,7 +15,7 @@ from px4fuse.report.card_text import (
     Line,
     card_lines,
     closing_lines,
-    headline,
+    headline_lines,
     to_ascii,
     with_typed_path,
 )
@@ -23,15 +23,15 @@ from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
 
-# Encodings of terminals that can print all characters of a card
+# Terminal encodings that contain all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Function that yields the lines of each kind of block
-CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
-INDENT = 9  # number of characters of a label
-COLUMN_POINTS = 6.0  # indent in the PDF (points) for one character on the terminal
+CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
+LABEL_COLUMNS = 9  # width (characters) of a label on the terminal
+POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
 MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
 # Terminal styles of text colours; the other colours belong to plots
-STYLES = {
+STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
     SEVERITY_COLOURS["warning"]: "yellow",
@@ -39,7 +39,7 @@ STYLES = {
     GOOD_COLOUR: "green",
 }
 # Commands in a text, without the full stop of the sentence
-_COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
+_COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
@@ -53,7 +53,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 print_paragraph(
                     console,
                     _styled_text(block),
-                    indent=round(block.get("indent", 0.0) / COLUMN_POINTS),
+                    indent=round(block.get("indent", 0.0) / POINTS_PER_COLUMN),
                 )
             case "labelled":
                 _show_labelled(console, block, request)
@@ -72,28 +72,30 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
 
 def _show_card(
     console: Console,
-    lines_of: Callable[[Card], Iterator[Line]],
+    make_lines: Callable[[Card], Iterator[Line]],
     card: Card,
     request: Request | None,
 ) -> None:
-    is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
+    is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
     log_argument = None if request is None else getattr(request, "log", None)
-    for line in lines_of(with_typed_path(card, log_argument)):
+    for line in make_lines(with_typed_path(card, log_argument)):
         for text in line.wrapped(min(console.width, CARD_WIDTH)):
-            console.print(Text(to_ascii(text) if is_limited else text, line.style), soft_wrap=True)
+            console.print(
+                Text(to_ascii(text) if is_ascii_terminal else text, line.style), soft_wrap=True
+            )
 
 
 def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
-    lines = block["label"]["text"].split("\n")
-    labels = [line for line in lines if len(line) < INDENT]
-    label_note = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
+    label_lines = block["label"]["text"].split("\n")
+    labels = [line for line in label_lines if len(line) < LABEL_COLUMNS]
+    long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_COLUMNS)
     for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
         text, commands = Text() if text_block is None else _styled_text(text_block), list[str]()
         if request is not None:
             text.plain, commands = expand_commands(text.plain, request)
-        text.append("" if index else label_note)
+        text.append("" if index else long_label_text)
         print_paragraph(
-            console, text, _styled_text({**block["label"], "text": label or ""}), INDENT
+            console, text, _styled_text({**block["label"], "text": label or ""}), LABEL_COLUMNS
         )
         for command in commands:
             print_line(console, "", command)
@@ -111,13 +113,15 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     commands = {
         command_line(request if name == "compare" else default_request, name, for_shell=True)
         + options: None
-        for name, options in _COMMAND.findall(text)
+        for name, options in _COMMAND_PATTERN.findall(text)
     }
-    return _COMMAND.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text), [*commands]
+    return _COMMAND_PATTERN.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text), [
+        *commands
+    ]
 
 
 def _styled_text(block: Block) -> Text:
-    style = STYLES.get(block["colour"], "")
+    style = STYLES_BY_COLOUR.get(block["colour"], "")
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
@@ -136,7 +140,7 @@ def print_paragraph(
 
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
     """Print a command or path on one line, so it can be copied."""
-    console.print(Text(f"{label:{INDENT}}", "bold").append(text, style), soft_wrap=True)
+    console.print(Text(f"{label:{LABEL_COLUMNS}}", "bold").append(text, style), soft_wrap=True)
 
 
 def _print_rows(
@@ -163,5 +167,5 @@ def _rich_table(
         table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical_alignment)
     for row in rows:
         texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
-        table.add_row(*(Text(text, STYLES.get(colour, "")) for text, colour in texts))
+        table.add_row(*(Text(text, STYLES_BY_COLOUR.get(colour, "")) for text, colour in texts))
     return table

@@ -54,22 +54,22 @@ def dot_style(colour: str, marker: str | int, size: float, edge: float = 0.0) ->
 
 
 # Style of the line of each track, by its name in legends
-LINES = {
+TRACK_LINES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
     "ground truth": line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5))),
 }
 # Style of the innovations of each filter
-DOTS = {"KF": dot_style(KF_COLOUR, "o", 2.0), "EKF2": dot_style(EKF2_COLOUR, "s", 2.2)}
+INNOVATION_DOTS = {"KF": dot_style(KF_COLOUR, "o", 2.0), "EKF2": dot_style(EKF2_COLOUR, "s", 2.2)}
 # Innovations that EKF2 rejected are hollow in all plots
-EKF2_REJECTED = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
+REJECTED_DOTS = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_DOTS = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
 # Colour of the ±2σ band of each filter
-BANDS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
+SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-MAX_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
-MAX_POINTS_NARROW = 500  # maximum number of drawn points of a curve in narrow axes
-MIN_WIDE_INCHES = 3.0  # minimum width (inches) of wide axes
+MAX_WIDE_POINTS = 1500  # maximum number of drawn points of a curve in wide axes
+MAX_NARROW_POINTS = 500  # maximum number of drawn points of a curve in narrow axes
+MIN_WIDE_AXES_INCHES = 3.0  # minimum width (inches) of wide axes
 
 
 @contextmanager
@@ -98,16 +98,20 @@ def draw_sigma_band(
     colour: str = KF_BAND_COLOUR,
 ) -> None:
     """Draw the ±2σ band about a series."""
-    time = centre.index.to_numpy()
-    drawn_time, upper = decimate_series(
-        time, np.asarray(centre + 2.0 * sigma, np.float64), _max_points(axes)
+    time_s = centre.index.to_numpy()
+    drawn_time_s, upper = decimate_series(
+        time_s, np.asarray(centre + 2.0 * sigma, np.float64), _max_points(axes)
     )
-    lower = np.interp(drawn_time, time, (centre - 2.0 * sigma).to_numpy())
-    axes.fill_between(drawn_time, lower, upper, color=colour, lw=0)
+    lower = np.interp(drawn_time_s, time_s, (centre - 2.0 * sigma).to_numpy())
+    axes.fill_between(drawn_time_s, lower, upper, color=colour, lw=0)
 
 
 def _max_points(axes: Axes) -> int:
-    return MAX_POINTS if axes.bbox.width / axes.figure.dpi > MIN_WIDE_INCHES else MAX_POINTS_NARROW
+    return (
+        MAX_WIDE_POINTS
+        if axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
+        else MAX_NARROW_POINTS
+    )
 
 
 def set_log_scale(axes: Axes) -> None:
@@ -123,8 +127,10 @@ def set_plain_ticks(axis: Axis) -> None:
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     low, high = axis.get_view_interval()
-    subs = (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
-    axis.set_major_locator(LogLocator(base=10.0, subs=subs))
+    decade_ticks = (
+        (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
+    )
+    axis.set_major_locator(LogLocator(base=10.0, subs=decade_ticks))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_locator(NullLocator())
 
@@ -145,20 +151,20 @@ def set_map_axes(axes: Axes, right: str, up: str) -> None:
     axes.locator_params(axis="y", nbins=6)
 
 
-def decimate_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
+def decimate_series(time: Array, value: Array, limit: int = MAX_WIDE_POINTS) -> tuple[Array, Array]:
     """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
     if len(time) <= limit:
         return time, value
     bucket_size, larger_bucket_count = divmod(len(time), limit // 2)
-    split, index_groups = larger_bucket_count * (bucket_size + 1), []
+    split_row, index_groups = larger_bucket_count * (bucket_size + 1), []
     for first_row, last_row, width in (
-        (0, split, bucket_size + 1),
-        (split, len(time), bucket_size),
+        (0, split_row, bucket_size + 1),
+        (split_row, len(time), bucket_size),
     ):
         buckets, starts = (
             value[first_row:last_row].reshape(-1, width),
             np.arange(first_row, last_row, width),
         )
         index_groups += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
-    selected = np.unique(np.concatenate(index_groups))
-    return time[selected], value[selected]
+    selected_rows = np.unique(np.concatenate(index_groups))
+    return time[selected_rows], value[selected_rows]

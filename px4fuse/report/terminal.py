@@ -33,7 +33,7 @@ def summary(
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal page of `px4fuse compare`: the diagnosis card.
+    """Make the terminal output of `px4fuse compare`: the diagnosis card.
 
     ``quiet`` prints only its headline; ``verbose`` adds settings, table of axes and findings.
     """

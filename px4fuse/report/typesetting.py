@@ -11,14 +11,16 @@ import typst
 from px4fuse.report import fonts
 
 # PDF/A-3a (archives) and PDF/UA-1 (screen readers)
-STANDARDS: list[Any] = ["a-3a", "ua-1"]
+PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
 TEMPLATES = ("cover.typ", "report.typ")
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
     """Typeset data as PDF, by default with the templates of the report."""
-    with TemporaryDirectory() as empty:
-        document = _compiler(report, template, empty).compile(format="pdf", pdf_standards=STANDARDS)
+    with TemporaryDirectory() as empty_folder:
+        document = _compiler(report, template, empty_folder).compile(
+            format="pdf", pdf_standards=PDF_STANDARDS
+        )
     assert isinstance(document, bytes)
     return document
 
@@ -27,24 +29,24 @@ def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
     """Typeset a cover without plots, and return the free height (points) below the card."""
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
-    with TemporaryDirectory() as empty:
-        answer = _compiler(data, None, empty).query("<free>", field="value", one=True)
+    with TemporaryDirectory() as empty_folder:
+        answer = _compiler(data, None, empty_folder).query("<free>", field="value", one=True)
     return float(json.loads(answer))
 
 
-def _compiler(report: Mapping[str, Any], template: str | None, empty: str) -> typst.Compiler:
+def _compiler(report: Mapping[str, Any], template: str | None, empty_folder: str) -> typst.Compiler:
     if template is None:
         folder = Path(__file__).parent
         template = "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)
     return typst.Compiler(
         input=template.encode(),
-        root=empty,
+        root=empty_folder,
         font_paths=typst.Fonts(
             include_system_fonts=False,
             include_embedded_fonts=False,
             font_paths=fonts.font_folders(tuple(report["fonts"])),
         ),
-        package_path=empty,
-        package_cache_path=empty,
+        package_path=empty_folder,
+        package_cache_path=empty_folder,
         sys_inputs={"data": json.dumps(report)},
     )

@@ -1,4 +1,4 @@
-"""Terminal page of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters."""
+"""Terminal output of ``px4fuse whatif``: EKF2 as logged, replayed, and with other parameters."""
 
 import math
 
@@ -18,7 +18,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import format_agreement, write_explanation
 from px4fuse.report.page import Page
 
-NOT_PREDICTABLE = "not predictable"
+NOT_PREDICTABLE_TEXT = "not predictable"
 
 
 def column_heads(analysis: WhatIfAnalysis) -> list[str]:
@@ -38,14 +38,14 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
     ]
 
 
-def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
+def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     """Return a row for each statistic of EKF2: as logged, replayed, and replayed with changes."""
     result = analysis.whatif
-    labels = _statistics(result.replayed, result.replayed)
+    labels = _statistic_texts(result.replayed, result.replayed)
     columns = [
-        _statistics(summary, result.replayed)
+        _statistic_texts(summary, result.replayed)
         if summary.is_predictable
-        else dict.fromkeys(labels, NOT_PREDICTABLE)
+        else dict.fromkeys(labels, NOT_PREDICTABLE_TEXT)
         for summary in (
             result.logged,
             result.replayed,
@@ -55,7 +55,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     return [[label, *(column.get(label, "n/a") for column in columns)] for label in labels]
 
 
-def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
+def _statistic_texts(summary: Summary, replayed: Summary) -> dict[str, str]:
     texts = dict[str, str]()
     for name, axis in summary.axes.items():
         texts |= _nis_texts(name, axis) | {
@@ -93,7 +93,7 @@ def _fusion_texts(summary: Summary) -> dict[str, str]:
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     """Return the headings, and a row of statistics for each value of the swept parameter."""
-    name, rows = swept_parameter(analysis), []
+    name, statistic_rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
     for summary in sweep_summaries(analysis):
         axes = summary.axes.values()
@@ -104,8 +104,8 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
             "/".join(_format_number(axis.position_rmse_to_truth_m) for axis in axes),
         ]
         if not summary.is_predictable:
-            cells = [NOT_PREDICTABLE, *[""] * 5]
-        rows.append([format_number(summary.changed[name]), *cells])
+            cells = [NOT_PREDICTABLE_TEXT, *[""] * 5]
+        statistic_rows.append([format_number(summary.changed[name]), *cells])
     head = [
         f"{name} ({unit})" if unit else name,
         "mean NIS N/E",
@@ -115,7 +115,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
         "σ_p N/E (m)",
         "RMSE N/E (m)",
     ]
-    return head, rows
+    return head, statistic_rows
 
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
@@ -137,16 +137,16 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
             f"The mean NIS is closest to 1 at {name} {format_number(best_summary.changed[name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
-        errors = {
-            error: summary.changed[name]
+        values_by_rmse_m = {
+            rmse_m: summary.changed[name]
             for summary in summaries
-            if isinstance(error := summary.position_rmse_to_truth_m, float)
+            if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
         }
-        if errors:
-            min_error_m = min(errors)
+        if values_by_rmse_m:
+            min_rmse_m = min(values_by_rmse_m)
             sentences.append(
                 f"The horizontal position RMSE against ground truth is smallest at {name} "
-                f"{format_number(errors[min_error_m])} ({min_error_m:.3f} m)."
+                f"{format_number(values_by_rmse_m[min_rmse_m])} ({min_rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
@@ -162,23 +162,25 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 
 def summary(analysis: WhatIfAnalysis) -> Page:
-    """Make the terminal page of ``px4fuse whatif``."""
+    """Make the terminal output of ``px4fuse whatif``."""
     page = Page()
     if AISLE in analysis.difference_steps:
         write_explanation(page, analysis.difference_steps[AISLE])
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
-    page.write_labelled("Used", f"All columns are evaluated over the time {spans}.")
+    span_texts = ", ".join(
+        f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
+    )
+    page.write_labelled("Used", f"All columns are evaluated over the time {span_texts}.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
-        text = (
+        no_change_text = (
             "No other position noise or delay fits this log better, so no parameter is changed. "
             "Test another value with --set NAME=VALUE."
         )
-        page.write_labelled("Change", text)
+        page.write_labelled("Change", no_change_text)
     head = ["", *column_heads(analysis)]
-    page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))
+    page.table(head, statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
     if sweep_summaries(analysis):
         page.table(*sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in sweep_notes(analysis):
