@@ -179,7 +179,7 @@ def set_value(value: Any, *path: Any) -> Change:
     return change
 
 
-def attached_results(pdf: bytes) -> ReportedResults:
+def read_attached_results(pdf: bytes) -> ReportedResults:
     """Read the attached results without the checks of read_report."""
     return read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
 
@@ -219,7 +219,7 @@ class VerifiedReport:
     def verified(self, pdf: bytes) -> Verification:
         """Verify a forged report with the log."""
         try:
-            report = attached_results(pdf)
+            report = read_attached_results(pdf)
         except ResultsError as error:  # rejected before verification
             return Verification("cannot verify", (str(error),), with_log=False)
         return verify(report, pdf, self.files, recompute=self.recompute)
@@ -231,6 +231,8 @@ class VerifiedReport:
 
 def make_verified_report(pdf: bytes, log: Path) -> VerifiedReport:
     files = files_by_sha256([log])
-    again = verification.recompute(attached_results(pdf), files)
+    again = verification.recompute(read_attached_results(pdf), files)
     drawn = again[1]()
-    return VerifiedReport(drawn, to_dict(attached_results(drawn)), (again[0], lambda: drawn), files)
+    return VerifiedReport(
+        drawn, to_dict(read_attached_results(drawn)), (again[0], lambda: drawn), files
+    )

@@ -16,13 +16,13 @@ from detector_rates import rates
 
 import px4fuse
 from px4fuse.classroom.assignment import assignment
-from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned
+from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned_flight
 from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
-    COUNT_FRACTIONS,
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
     LOOP_FRACTION,
+    MISTAKE_COUNT_FRACTIONS,
     RULES_BY_KIND,
     derive_key,
     draw,
@@ -63,11 +63,11 @@ def cached_flights():
 
     def from_memory(*given):
         if repr(given) not in made:
-            made[repr(given)] = simulate_assigned(*given)
+            made[repr(given)] = simulate_assigned_flight(*given)
         return made[repr(given)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assignment, "simulate_assigned", from_memory)
+        patch.setattr(assignment, "simulate_assigned_flight", from_memory)
         yield
 
 
@@ -81,7 +81,7 @@ def files(folder):
 class TestDraw:
     def test_assigned_flights_of_equal_secret_and_id_are_equal(self):
         given = SECRET, CLASS[0], "aisle", 2, True
-        assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
+        assert simulate_assigned_flight(*given) == assignment.simulate_assigned_flight(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
@@ -107,7 +107,7 @@ class TestDraw:
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
     def test_assigned_flights_have_0_to_2_faults_as_configured(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
-        for count, share in enumerate(COUNT_FRACTIONS[kind]):
+        for count, share in enumerate(MISTAKE_COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.mistake for one in flights for choice in choices_of(one)}
@@ -177,7 +177,7 @@ class TestDraw:
 def test_assigned_log_has_a_finding_for_each_fault_of_key(
     tmp_path, monkeypatch, kind, number, count
 ):
-    log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
+    log, answer = assignment.simulate_assigned_flight(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
     monkeypatch.setattr(ulog_topics, "ASSESSED_KEY", "no such key")
@@ -254,14 +254,14 @@ class TestAssign:
 
     def test_assign_flights_interrupted_run_is_continued(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        flown = assignment.simulate_assigned
+        flown = assignment.simulate_assigned_flight
 
         def stop_at_last(*given):
             if given[1] == CLASS[-1]:
                 raise KeyboardInterrupt
             return flown(*given)
 
-        monkeypatch.setattr(assignment, "simulate_assigned", stop_at_last)
+        monkeypatch.setattr(assignment, "simulate_assigned_flight", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
             assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
@@ -303,7 +303,8 @@ class TestAssign:
 class TestKey:
     def key(self):
         answers = (
-            assignment.simulate_assigned(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2]
+            assignment.simulate_assigned_flight(SECRET, one, "aisle", 2, True)[1]
+            for one in CLASS[:2]
         )
         return AnswerKey("aisle", tuple(answers), "s")
 

@@ -19,16 +19,16 @@ from exchange import replace
 from forgery import (
     Change,
     VerifiedReport,
-    attached_results,
     forged,
     make_verified_report,
     on_page,
     read_again,
+    read_attached_results,
     set_value,
 )
 from results_tools import LOOP, changed_results, decode_results
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import form_truth
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
@@ -124,8 +124,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     (sha256,) = honest.files
     truth = form_truth(simulation, sha256)
     answers = (
-        Answer("s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth),
-        Answer("s02", "Bob", "s02.ulg", "b" * 64),
+        RightAnswers(
+            "s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth
+        ),
+        RightAnswers("s02", "Bob", "s02.ulg", "b" * 64),
     )
     return Flight(honest, AnswerKey("aisle", answers))
 
@@ -133,7 +135,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 @pytest.fixture(scope="module")
 def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     verdict = flight.honest.verified(flight.honest.pdf)
-    return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
+    return flight.graded(read_attached_results(flight.honest.pdf), verdict, rubric)
 
 
 def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedReport) -> None:
@@ -302,11 +304,11 @@ def test_grade_of_pdf_with_overpainted_page_uses_log_results(
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
-    graded = flight.graded(attached_results(pdf), verdict, rubric)
+    graded = flight.graded(read_attached_results(pdf), verdict, rubric)
     assert graded.status == "page differs"
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
-        strict = flight.graded(attached_results(pdf), verdict, replace(rubric, pages=rule))
+        strict = flight.graded(read_attached_results(pdf), verdict, replace(rubric, pages=rule))
         assert strict.counted_points == counted
 
 
@@ -328,7 +330,9 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
-    key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
+    key = truth and AnswerKey(
+        "loop", (RightAnswers("s01", "", "", LOOP["track"]["sha256"], *truth),)
+    )
     verdict = Verification("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)

@@ -16,7 +16,7 @@ from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.class_page import count_tenths, html_text
+from px4fuse.classroom.grading.class_page import class_page_html, count_tenths
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.classroom.grading.outputs import anonymise_entry
 from px4fuse.html.safe import MAX_TEXT_LENGTH
@@ -116,7 +116,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
 
 
 def test_class_page_matches_reference_file() -> None:
-    text = html_text(CLASS, "Class", "px4fuse 1")
+    text = class_page_html(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
     lines += of_values(content(text))
@@ -132,7 +132,7 @@ def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
             numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
             instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
-        return html_text([one], word, word)
+        return class_page_html([one], word, word)
 
     made = page(text)
     made.encode()
@@ -145,7 +145,7 @@ def test_class_page_average_excludes_pending_points() -> None:
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
                row("Cy", 12.0, instructor_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
-    text = html_text(entries, "Class", "px4fuse 1")
+    text = class_page_html(entries, "Class", "px4fuse 1")
     assert "2 min late" in text  # 61 s are rounded up
     assert "14.3 <small>of 20" in text  # mean of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
@@ -158,12 +158,12 @@ def test_class_page_average_excludes_pending_points() -> None:
 
 def test_class_page_shortens_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
-    text = html_text([odd], "Class", "px4fuse 1")
+    text = class_page_html([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_TEXT_LENGTH
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
     one = GradedReport("a.pdf", "Ada", "1", Verification("numbers differ", ("60.",), True, apart))
-    text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")
+    text = class_page_html([Entry("Ada", "1", one)], "Class", "px4fuse 1")
     assert '["axes.49","1.0","2.0"]' in text
 
 
@@ -198,7 +198,7 @@ def anonymous_class() -> list[Entry]:
 
 
 def test_class_page_in_anonymous_mode_contains_no_names() -> None:
-    text = html_text(anonymous_class(), "Class", "px4fuse 1")
+    text = class_page_html(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
         for word in (*name.split(), student_id, *re.split(r"[/. _]", file)):
@@ -226,7 +226,7 @@ def test_class_page_in_anonymous_mode_contains_no_names() -> None:
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path) -> Browser:
     file = tmp_path / "class.html"
-    file.write_bytes(html_text(CLASS, "Navigation lab & more", "px4fuse 1").encode())
+    file.write_bytes(class_page_html(CLASS, "Navigation lab & more", "px4fuse 1").encode())
     browser.open(file)
     return browser
 
@@ -289,7 +289,7 @@ def test_class_page_keys_select_next_and_previous_report(page: Browser) -> None:
 
 def test_class_page_links_the_redrawn_report() -> None:
     one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
-    made = content(html_text([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
+    made = content(class_page_html([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]
     assert made["rows"][1][3] == []

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item
-from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
+from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, class_table_csv
 from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
 from px4fuse.verification.model import Verification
 
@@ -64,7 +64,7 @@ def may_be_formula(cell: str) -> bool:
 
 @given(texts)
 def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
-    made = csv_text([graded(text, {text: -3.25})])
+    made = class_table_csv([graded(text, {text: -3.25})])
     made.encode()
     for delimiter in (",", ";", "\t"):
         for row in cells(made, delimiter):
@@ -77,7 +77,7 @@ def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> Non
 def test_class_table_csv_contains_neutralised_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
-    head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
+    head, *rest = cells(class_table_csv([graded(text, numbers) for text, numbers in rows]))
     assert tuple(head[: len(FIRST_COLUMNS)]) == FIRST_COLUMNS
     assert tuple(head[-len(LAST_COLUMNS) :]) == LAST_COLUMNS
     assert len(rest) == len(rows)
@@ -127,7 +127,7 @@ def test_neutralise_csv_formulas_changes_only_formulas() -> None:
 
 
 def test_class_table_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
-    made = csv_text([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
+    made = class_table_csv([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
     (_, row) = cells(made)
@@ -138,7 +138,7 @@ def test_class_table_csv_lists_late_and_missing_students() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)
-    head, *rest = cells(csv_text([late, pending, Entry("C", "-17", None, max_points=4.0)]))
+    head, *rest = cells(class_table_csv([late, pending, Entry("C", "-17", None, max_points=4.0)]))
     asked = ("id", "status", "points", "pending points", "deducted", "total", "hours late",
              "pending", "comment")  # fmt: skip
     assert [[dict(zip(head, row, strict=True))[name] for name in asked] for row in rest] == [
@@ -146,7 +146,7 @@ def test_class_table_csv_lists_late_and_missing_students() -> None:
         ["1", "verified", "", "1.5", "", "", "", "Run 0.1.1.", ""],
         ["-17", "missing", "", "", "", "", "", "", ""],
     ]
-    assert len(cells(csv_text([]))) == 1
+    assert len(cells(class_table_csv([]))) == 1
     assert (
         len(neutralise_formulas("=" * 10**6)) <= MAX_CELL_LENGTH + 1
     )  # maximum length of a cell in Excel

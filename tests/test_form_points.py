@@ -19,9 +19,9 @@ from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTr
 from px4fuse.classroom.grading.form_points import (
     PART_NAMES,
     POINTS_TABLE,
+    accepted_corrections,
     form_points,
-    panels,
-    right_corrections,
+    panels_showing,
 )
 from px4fuse.cli.simulate import simulate
 from px4fuse.results.answer_form import (
@@ -93,16 +93,16 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = right_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = accepted_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
-        assert set(panels(name)) > {"cover"}
+        assert set(panels_showing(name)) > {"cover"}
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert form_points(RIGHT, TRUTH).is_kind_named == {"clock-offset": True, "dropout": True}
+    assert form_points(RIGHT, TRUTH).is_named_by_kind == {"clock-offset": True, "dropout": True}
 
 
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))

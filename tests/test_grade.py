@@ -17,7 +17,7 @@ from conftest import LOG, REPORT, REPORT_PAGES
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.roster import file_names
 from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
@@ -97,7 +97,7 @@ def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).reports
     assert only.status == "cannot verify"
-    assert only.instructor_action.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.instructor_action.startswith("Ask the author of the report for the PDF")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
@@ -193,7 +193,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
     (sha256,) = files_by_sha256([LOG])
     rubric, logs = read_rubric(None), [tmp_path / "logs"]
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
-        key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
+        key = AnswerKey("aisle", (RightAnswers("1", "Ada", "1.ulg", given),))
         outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
         (one,) = outcome.reports
         assert one.verdict.status == status

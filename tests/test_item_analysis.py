@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from class_tools import entry, graded_report
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import Item
@@ -55,7 +55,7 @@ def test_item_analysis_lists_form_parts_and_faults() -> None:
     *_, sizes, fault = analyse_items(reports)
     assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
     assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
-    assert fault.row[1:3] == ("5", "0.6")
+    assert fault.csv_row[1:3] == ("5", "0.6")
 
 
 def test_item_analysis_excludes_reports_with_open_decision() -> None:
@@ -76,7 +76,7 @@ def test_oral_questions_ask_about_false_and_missed_faults_first() -> None:
 
 
 def test_oral_questions_page_lists_n_questions_of_each_student() -> None:
-    key = AnswerKey("aisle", (Answer("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
+    key = AnswerKey("aisle", (RightAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
     report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
     rows = (replace(entry("s1", "Ada", 5.0), counted_report=report), entry("s2", "Max", None))
     text = questions_text(rows, key, 2)

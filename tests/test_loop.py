@@ -16,7 +16,11 @@ from px4fuse.findings import find_loop
 from px4fuse.flight.model import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
-from px4fuse.loop.corrections import BY_DISTANCE, POSITIONS_ONLY, SINGLE_LOOP_REASON
+from px4fuse.loop.corrections import (
+    HEADINGS_CORRECTED_LABEL,
+    POSITIONS_CORRECTED_LABEL,
+    SINGLE_LOOP_REASON,
+)
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
@@ -151,12 +155,15 @@ def test_loop_correction_with_heading_does_not_increase_rpe(sample_loop: Loop) -
 
 
 def test_loop_corrections_without_heading_error_are_equal(sample, sample_loop) -> None:
-    assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
+    assert [part.name for part in sample_loop.reported_paths[1:3]] == [
+        POSITIONS_CORRECTED_LABEL,
+        HEADINGS_CORRECTED_LABEL,
+    ]
     found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
     names = [part.name for part in found.reported_paths]
-    assert POSITIONS_ONLY in names
-    assert BY_DISTANCE not in names
+    assert POSITIONS_CORRECTED_LABEL in names
+    assert HEADINGS_CORRECTED_LABEL not in names
     plain, turned = (path(found, way).trajectory for way in ("by_distance_plain", "by_distance"))
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 

@@ -24,7 +24,7 @@ from mcp.client.stdio import StdioServerParameters
 from mcp.shared.exceptions import MCPError
 from ulog_tools import load
 
-from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
@@ -421,7 +421,7 @@ def test_answer_is_computed_again_if_the_log_changed(tmp_path: Path, monkeypatch
 
 @pytest.mark.process
 def test_server_withholds_diagnosis_of_assigned_flight(tmp_path: Path) -> None:
-    content, _ = simulate_assigned(b"a secret for tests", Person("s01"), "aisle", 2)
+    content, _ = simulate_assigned_flight(b"a secret for tests", Person("s01"), "aisle", 2)
     (tmp_path / "s01.ulg").write_bytes(content)
 
     async def talk(client: Client) -> None:

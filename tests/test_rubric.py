@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from px4fuse.classroom.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
+from px4fuse.classroom.grading.rubric import AnyRubricItem, parse_rubric, read_rubric, rubric_text
 from px4fuse.errors import SettingsError
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
@@ -15,7 +15,7 @@ NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 def test_default_rubric_contains_each_check_and_its_parameters():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
-    checks = AnyItem.__args__
+    checks = AnyRubricItem.__args__
     assert used == {check.__struct_config__.tag for check in checks}
     for check in checks:
         for name in check.__struct_fields__:

@@ -18,7 +18,7 @@ from results_tools import (
     finding,
 )
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.classroom.grading.model import Entry, GradedReport
@@ -27,8 +27,8 @@ from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_re
 from px4fuse.errors import ResultsError
 from px4fuse.findings import TITLES
 from px4fuse.results.answer_form import Answers, StudentMistake
-from px4fuse.results.contract import to_json_dict
-from px4fuse.simulation.flights import HARDWARE
+from px4fuse.results.contract import to_plain
+from px4fuse.simulation.flights import SIMULATION_HARDWARE
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import verify
@@ -89,7 +89,7 @@ JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_chan
 OVERSTATED = changed_results(horizontal__kf__verdict="underconfident", horizontal__kf__nis_mean=0.5)
 UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 4.4}
 AFTER = "loop__corrections__by_distance"
-WORSE = {"slam.tum": to_json_dict(correction(0.5, 1.4))["scores"]["slam.tum"]}
+WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed_results(
     LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}]
 )
@@ -114,7 +114,7 @@ CHECKED = [
     ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
-    ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
+    ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "does not contain"),
     ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
      "without --axis"),
     ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
@@ -169,8 +169,8 @@ TRUTH = FormTruth(
 
 
 def key(*mistakes, sha256=SHA, **values):
-    answer = Answer("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
-    other = Answer("s02", "Bob", "s02.ulg", "b" * 64)
+    answer = RightAnswers("s01", "Ann", "s01.ulg", sha256, {}, mistakes, form=TRUTH, **values)
+    other = RightAnswers("s02", "Bob", "s02.ulg", "b" * 64)
     return AnswerKey("aisle", (answer, other))
 
 
@@ -359,7 +359,7 @@ class TestFeedback:
         ({"request__start_s": 1.0}, ()),
         ({"settings__end_s": 50.0}, ()),
         ({"settings__input": "zero"}, ("IMU",)),
-        ({"log__hardware": HARDWARE}, ("simulate",)),
+        ({"log__hardware": SIMULATION_HARDWARE}, ("simulate",)),
         ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )

@@ -18,7 +18,12 @@ import pytest
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading import submissions
 from px4fuse.classroom.grading.model import Submission
-from px4fuse.classroom.grading.submissions import add_origins, find_submissions, parse_origin, read
+from px4fuse.classroom.grading.submissions import (
+    add_origins,
+    find_submissions,
+    parse_origin,
+    read_submission,
+)
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
@@ -42,7 +47,7 @@ def write(path: Path, content: bytes) -> Path:
 
 def reason(submission: Submission) -> str:
     with pytest.raises(ResultsError) as refused:
-        read(submission)
+        read_submission(submission)
     assert "\n" not in str(refused.value)
     return str(refused.value)
 
@@ -68,7 +73,7 @@ def test_find_submissions_searches_folders_recursively(tmp_path):
     found, notes = find_submissions([tmp_path])
     assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
     assert notes[0].startswith("Ignored files (not PDF): 3 (")
-    assert [read(each) for each in found] == [PDF] * 3
+    assert [read_submission(each) for each in found] == [PDF] * 3
     assert all(each.zip_entry == "" for each in found)
 
 
@@ -184,7 +189,7 @@ def test_find_submissions_does_not_open_zip_inside_export(tmp_path):
     assert [each.name for each in found] == [name]
     assert name_and_number(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
-        read_report(read(found[0]), found[0].name)
+        read_report(read_submission(found[0]), found[0].name)
     assert (
         str(refused.value) == f"{name}: the file is not a PDF. Hand in the file that px4fuse wrote."
     )
@@ -273,7 +278,7 @@ def test_find_submissions_removes_control_characters_from_names(tmp_path):
     before = sorted(tmp_path.rglob("*"))
     found, _ = find_submissions([path])
     assert {each.name for each in found} == set(shown_as.values())
-    assert all(read(each) == PDF for each in found)
+    assert all(read_submission(each) == PDF for each in found)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -303,7 +308,7 @@ def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
     assert "cannot be read" in reason(single_submission(path))
     monkeypatch.setattr(submissions, "MAX_PDF_BYTES", len(PDF))
     path.write_bytes(zipped({"just.pdf": PDF}))
-    assert read(single_submission(path)) == PDF
+    assert read_submission(single_submission(path)) == PDF
 
 
 @pytest.mark.parametrize(
@@ -360,7 +365,7 @@ def test_find_submissions_makes_equal_file_names_unique(tmp_path):
     folders = [tmp_path / folder for folder in "abc"]
     found, _ = find_submissions([*folders, *folders])
     assert [each.name for each in found] == ["Report.pdf", "Report.pdf (2)", "Report.pdf (3)"]
-    assert [read(each) for each in found] == [b"a", b"b", b"c"]
+    assert [read_submission(each) for each in found] == [b"a", b"b", b"c"]
     # names without the UTF-8 flag
     content = zipped({"M_ller.pdf": PDF, "Zo__.pdf": PDF})
     content = content.replace(b"M_ller", b"M\x81ller").replace(b"Zo__", "Zoë".encode())
@@ -383,5 +388,5 @@ def test_find_submissions_on_fuzzed_zip_raises_no_exception(tmp_path):
             continue
         for each in found:
             with suppress(ResultsError):
-                assert isinstance(read(each), bytes)
+                assert isinstance(read_submission(each), bytes)
         assert all("\n" not in note for note in notes)

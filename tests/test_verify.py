@@ -21,7 +21,6 @@ from forgery import (
     VerifiedReport,
     append_update,
     array,
-    attached_results,
     catalogue,
     dictionary,
     document_info,
@@ -33,6 +32,7 @@ from forgery import (
     on_page,
     pdf_bytes,
     read_again,
+    read_attached_results,
     set_value,
     text,
     to_dict,
@@ -48,7 +48,7 @@ from results_tools import finding
 
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import to_json, to_json_dict
+from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import (
@@ -94,7 +94,9 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
 
 def test_verify_unchanged_example_report_returns_verified(aisle: VerifiedReport) -> None:
     shipped = REPORT.read_bytes()
-    verdict = verify(attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute)
+    verdict = verify(
+        read_attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute
+    )
     assert verdict.status == "verified", verdict
     assert verdict.with_log
     assert verdict.page_status == "same"
@@ -113,7 +115,7 @@ def test_verify_report_without_log_returns_cannot_verify(
     aisle: VerifiedReport, loop: VerifiedReport
 ) -> None:
     for one in (aisle, loop):
-        verdict = verify(attached_results(one.pdf), one.pdf, {})
+        verdict = verify(read_attached_results(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
         assert verdict.reasons == (NO_LOG_REASON,)
         assert verdict.redrawn == b""
@@ -152,12 +154,16 @@ def test_verify_report_from_other_platform_is_verified(
     drawn = move_lines(one.pdf, 0.01)
     scaled_results = read_again(scaled(json.loads(to_json(one.again[0])), -1e-9))
     elsewhere = (scaled_results, lambda: drawn)
-    verdict = verify(attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
+    verdict = verify(
+        read_attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere
+    )
     assert verdict.outcome == "verified", verdict
     assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
     aside = move_lines(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
-    verdict = verify(attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
+    verdict = verify(
+        read_attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere
+    )
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
     assert verdict.redrawn == aside
 
@@ -167,7 +173,7 @@ def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> N
     scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
     elsewhere = (scaled_results, lambda: forged(aisle.pdf))
     verdict = verify(
-        attached_results(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere
+        read_attached_results(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere
     )
     assert verdict.outcome == "verified", verdict
 
@@ -221,7 +227,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 def leaf_of_each_name() -> list[tuple[Any, ...]]:
     """Return one path to a value for each name in the results."""
-    results = to_dict(attached_results(REPORT.read_bytes()))
+    results = to_dict(read_attached_results(REPORT.read_bytes()))
     # other tests cover the log, the version, and texts that are printed
     apart = ("schema", "student", "provenance")
     kinds = {
@@ -259,7 +265,7 @@ def change_value(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, An
 def test_verify_finds_each_kind_of_changed_value(
     aisle: VerifiedReport, path: tuple[Any, ...]
 ) -> None:
-    found, *_ = compare_results(change_value(aisle.results, path), to_json_dict(aisle.again[0]))
+    found, *_ = compare_results(change_value(aisle.results, path), to_plain(aisle.again[0]))
     difference = found[0]  # an additional list has paths below this one
     assert difference.path.startswith(".".join(map(str, path)))
 
@@ -329,7 +335,7 @@ def test_verify_report_with_changed_student_name_is_not_verified(
     set_value({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
     again = verification.recompute(read_again(results), loop.files)
     pdf = loop.with_results(results)
-    verdict = verify(attached_results(pdf), pdf, loop.files, recompute=lambda *_: again)
+    verdict = verify(read_attached_results(pdf), pdf, loop.files, recompute=lambda *_: again)
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
     assert verdict.redrawn != loop.pdf
@@ -492,7 +498,7 @@ def test_verify_report_with_changed_pdf_document_states_reason(
     # the class table prints the first reason
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
-        assert verdict.remedy.startswith("Ask for the PDF")
+        assert verdict.remedy.startswith("Ask the author of the report")
         assert LIMIT_NOTE not in verdict.reasons
 
 
@@ -569,7 +575,7 @@ def test_verify_gives_expected_outcome_for_each_pdf_change(
 
 def test_verify_with_log_of_other_flight_returns_other_log(aisle: VerifiedReport) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
-        verdict = verify(attached_results(aisle.pdf), aisle.pdf, files)
+        verdict = verify(read_attached_results(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"
         assert not verdict.with_log
 
@@ -580,7 +586,7 @@ def test_verify_finds_all_input_files_by_sha256(tmp_path: Path) -> None:
     positions, target = SAMPLES / "aisle_uwb_external.csv", tmp_path / "joined.pdf"
     run_checked("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
     pdf = target.read_bytes()
-    report = attached_results(pdf)
+    report = read_attached_results(pdf)
     (tmp_path / "a").write_bytes(LOG.read_bytes())
     (tmp_path / "b").write_bytes(positions.read_bytes())
     verdict = verify(report, pdf, files_by_sha256([tmp_path / "a"]))

@@ -11,7 +11,7 @@ from cli_tools import error_line, run, run_checked
 from exchange import replace
 from form_guesses import right
 
-from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
@@ -38,7 +38,7 @@ class Assigned(NamedTuple):
 @pytest.fixture(scope="module")
 def assigned(tmp_path_factory: pytest.TempPathFactory) -> Assigned:
     folder = tmp_path_factory.mktemp("assigned")
-    content, answer = simulate_assigned(SECRET, Person("s01"), "aisle", 2)
+    content, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     log, form, report = (folder / name for name in ("s01.ulg", "s01.toml", "s01.pdf"))
     log.write_bytes(content)
     text = form_text(log.name, answer.sha256)
@@ -105,7 +105,7 @@ def test_report_of_log_without_mark_is_not_verified(assigned: Assigned, tmp_path
 
 
 def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
-    _, answer = simulate_assigned(SECRET, Person("s1"), "aisle", 1)
+    _, answer = simulate_assigned_flight(SECRET, Person("s1"), "aisle", 1)
     assert answer.form is not None
     predictions = answer.form.predictions
     assert len(predictions) >= 6
@@ -116,7 +116,7 @@ def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
 
 
 def test_predictions_outweigh_a_diagnosis_without_evidence() -> None:
-    _, answer = simulate_assigned(SECRET, Person("s01"), "aisle", 2)
+    _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)
     assert form_points(complete, answer.form).fraction == pytest.approx(1.0)

@@ -15,7 +15,7 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
-from px4fuse.verification.pdf_input import MAX_PDF_BYTES, attached_results
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
@@ -65,7 +65,7 @@ def _read_given_results(path: Path) -> InputResults | None:
     limit_bytes = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
     content = read_bytes_limited(path, ResultsError, limit_bytes, size_remedy=remedy)
-    results = (attached_results if is_report else read_results)(content, name)
+    results = (read_attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(
             f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "

@@ -118,7 +118,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         A file with this path exists and is not a report on the same input files and student.
     """
     from px4fuse.results.reading import read_results
-    from px4fuse.verification.pdf_input import attached_results
+    from px4fuse.verification.pdf_input import read_attached_results
 
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > MAX_NAME_BYTES:
@@ -126,7 +126,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     fault = "the file is not a report of this px4fuse version on the same input files and student"
-    _check_default(path, fault, partial(_is_same_report, results, attached_results))
+    _check_default(path, fault, partial(_is_same_report, results, read_attached_results))
     json_path = path.with_suffix(".json")
     _check_default(json_path, fault, partial(_is_same_report, results, read_results))
     return path

@@ -12,7 +12,7 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
-DOWN = np.array([0.0, 0.0, 1.0])
+DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
 # Conversion of each frame to a frame with z down: order and signs of the axes, new frame, and note
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
@@ -36,10 +36,10 @@ _Z_DOWN_CONVERSIONS: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
 }
 # Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
 # the extent
-SPACING_FRACTION = 0.02
+KEY_FRAME_SPACING_FRACTION = 0.02
 # Minimum and maximum of the default key frame spacing (m)
-MIN_SPACING_M = 0.02
-MAX_SPACING_M = 0.5
+MIN_KEY_FRAME_SPACING_M = 0.02
+MAX_KEY_FRAME_SPACING_M = 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
@@ -81,7 +81,11 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 def default_key_frame_spacing_m(position_m: Array) -> float:
     """Return the default key frame spacing (m) of a path, shape (n, d)."""
     extent_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
-    return float(np.clip(SPACING_FRACTION * extent_m, MIN_SPACING_M, MAX_SPACING_M))
+    return float(
+        np.clip(
+            KEY_FRAME_SPACING_FRACTION * extent_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M
+        )
+    )
 
 
 def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
@@ -140,10 +144,10 @@ def correct_by_distance(
     """
     position_m = trajectory.position_m
     fraction = cumulative_distance_m / cumulative_distance_m[-1]
-    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN))
+    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN_DIRECTION))
     middle_fraction = (fraction[1:] + fraction[:-1]) / 2.0
     middle_rotation = Rotation.from_rotvec(
-        np.outer(-middle_fraction * misclosure_heading_rad, DOWN)
+        np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
     rotated_m = position_m[0] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]

@@ -20,14 +20,14 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
 from px4fuse.trajectory.model import Trajectory
 
-UNCORRECTED = "uncorrected"
-POSITIONS_ONLY = "positions corrected by distance"
-BY_DISTANCE = "positions and headings corrected by distance"
+UNCORRECTED_LABEL = "uncorrected"
+POSITIONS_CORRECTED_LABEL = "positions corrected by distance"
+HEADINGS_CORRECTED_LABEL = "positions and headings corrected by distance"
 # Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
-    "uncorrected": UNCORRECTED,
-    "by_distance_plain": POSITIONS_ONLY,
-    "by_distance": BY_DISTANCE,
+    "uncorrected": UNCORRECTED_LABEL,
+    "by_distance_plain": POSITIONS_CORRECTED_LABEL,
+    "by_distance": HEADINGS_CORRECTED_LABEL,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
 SINGLE_LOOP_REASON = (

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.closure import DOWN, heading_change_rad
+from px4fuse.loop.closure import DOWN_DIRECTION, heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
@@ -152,7 +152,9 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
     if path.rotation is not None:
         nose_direction = path.rotation[0].apply([1.0, 0.0, 0.0])
         heading_rad = float(np.arctan2(nose_direction[1], nose_direction[0]))
-    displacement_m = Rotation.from_rotvec(heading_rad * DOWN).apply([forward_m, right_m, 0.0])
+    displacement_m = Rotation.from_rotvec(heading_rad * DOWN_DIRECTION).apply(
+        [forward_m, right_m, 0.0]
+    )
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=heading_change_deg,
@@ -177,7 +179,9 @@ def read_end_from_truth(
     landing_distance_m = np.linalg.norm(displacement_m)
     if path.rotation is not None and true_path.rotation is not None:
         heading_difference_rad = heading_change_rad(path.rotation[0] * true_path.rotation[0].inv())
-        displacement_m = Rotation.from_rotvec(heading_difference_rad * DOWN).apply(displacement_m)
+        displacement_m = Rotation.from_rotvec(heading_difference_rad * DOWN_DIRECTION).apply(
+            displacement_m
+        )
         true_change_deg = heading_change_deg(true_path)
     elif path.frame != true_path.frame:
         return "the ground truth cannot be rotated to the odometry frame without orientation"

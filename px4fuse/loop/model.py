@@ -86,7 +86,7 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 class Closure(Record, frozen=True, kw_only=True):
     """Loop closure (two times at the same place), with gate result and robust weight."""
 
-    # Times on the clock of the trajectory
+    # Two times at the same place, on the clock of the trajectory
     time_1_s: float
     time_2_s: float
     # σ of the displacement between the two times, per axis
@@ -95,7 +95,7 @@ class Closure(Record, frozen=True, kw_only=True):
     source: str
     # Closure error: displacement from odometry minus true displacement
     distance_m: NotNegative
-    # Gate: squared Mahalanobis distance, degrees of freedom, p-value and decision
+    # Gate: squared Mahalanobis distance, degrees of freedom, p-value, and True for acceptance
     d2: NotNegative
     degrees_of_freedom: Count
     p: Share
@@ -115,7 +115,7 @@ class CorrectedPath(Record, frozen=True, kw_only=True):
     # Largest and RMS displacement of the poses by the correction
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
-    # Fields of the pose graph solution; None for a correction without pose graph
+    # Cost (initial, final), iterations and convergence of the pose graph; None without pose graph
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None

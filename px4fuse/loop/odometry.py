@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Unavailable
-from px4fuse.loop.closure import DOWN, heading_change_rad
+from px4fuse.loop.closure import DOWN_DIRECTION, heading_change_rad
 from px4fuse.loop.model import OdometryNoise, TrueEnd
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.graph import lie
@@ -156,8 +156,10 @@ def build_pose_graph(
             error_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_change_rad)
             )
-            second_rotation[row] = Rotation.from_rotvec(error_rad * DOWN) * second_rotation[row]
-            vertical_direction = second_rotation[row].inv().apply(DOWN)
+            second_rotation[row] = (
+                Rotation.from_rotvec(error_rad * DOWN_DIRECTION) * second_rotation[row]
+            )
+            vertical_direction = second_rotation[row].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
             information[row, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2

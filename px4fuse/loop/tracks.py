@@ -35,7 +35,7 @@ from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, TrajectoryKin
 
 TrackName = Literal["vio", "ekf2", "kf", "truth"]
 TRACK_NAMES: tuple[TrackName, ...] = get_args(TrackName)
-_HEAD_BYTES = 4096
+_FILE_HEAD_BYTES = 4096
 _G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
@@ -199,7 +199,7 @@ def is_g2o(path: Path) -> bool:
     TrajectoryError
         The file cannot be read.
     """
-    head = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
     return decode_text(head) is not None and any(
         line.strip().startswith(_G2O_TAGS) for line in head.splitlines()
     )
@@ -233,7 +233,7 @@ def read_source(
         ``frame`` is given for a flight log.
     """
     path, track_name = split_path_and_part(argument)
-    head = b"bag" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):

@@ -33,9 +33,9 @@ LEAD = (
 MAX_LISTED_CLOSURES = 10
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED: LINES["EKF2"],
-    corrections.POSITIONS_ONLY: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
-    corrections.BY_DISTANCE: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
+    corrections.UNCORRECTED_LABEL: LINES["EKF2"],
+    corrections.POSITIONS_CORRECTED_LABEL: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
+    corrections.HEADINGS_CORRECTED_LABEL: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
     SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
     SOLUTIONS["all"]: style.line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }

@@ -61,7 +61,7 @@ class FormChoices(Record, frozen=True):
 _CHOICES = read_toml(__file__, "form.toml", FormChoices)
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
-# Corrections of injected faults, with the units of their values (empty without a value)
+# Units of the value of a correction (empty without a value), by name of the correction
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 # Verdict on a filter without innovations
 NOT_AVAILABLE = "not available"
@@ -72,7 +72,7 @@ Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
 RangeName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
-# Accepted values of the fields that are not numbers, for messages
+# Description of the accepted values of a text field of the answer form, by field name
 ACCEPTED_VALUES = {
     **dict.fromkeys(
         ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
@@ -179,7 +179,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Quantities for the three questions of a form: one of each pair is drawn at random
+# Kinds of the three questions of a form: one of each pair is drawn at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -213,14 +213,14 @@ class FormQuestion(Record, frozen=True):
             "innovation": f"innovation of update {update} (m)",
             "nis": f"NIS of update {update}",
             "prediction": f"position sigma (m) {number} s after update {update}, no measurement",
-            "gate": f"list of the updates {update} to {update + GATE_UPDATES} with an innovation "
-            f"outside {number} sqrt(S); KF uses these updates, too",
+            "gate": f"list of the updates {update} to {update + GATE_QUESTION_UPDATES} with an "
+            f"innovation outside {number} sqrt(S); KF uses these updates, too",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of KF updates that a question about the innovation gate covers
-GATE_UPDATES = 20
+# Number of the KF updates after the first update in a question about the innovation gate
+GATE_QUESTION_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
@@ -230,14 +230,14 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
     def draw_between(low: float, high: float, decimals: int) -> float:
         return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
 
-    settings = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
+    sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_or_gate = draw_between(*limits, 1)
+    duration_or_gate_limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
+    duration_or_gate = draw_between(*duration_or_gate_limits, 1)
     return (
-        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *settings),
-        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *settings),
-        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *settings, duration_or_gate),
+        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
+        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
+        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, duration_or_gate),
     )
 
 
@@ -254,7 +254,7 @@ def read_answers(path: Path) -> Answers:
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
     record: dict[str, Any] = {}
     try:
-        record = _as_record(tomllib.loads(text))
+        record = _convert_form(tomllib.loads(text))
         answers = msgspec.convert(record, Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
@@ -266,44 +266,48 @@ def read_answers(path: Path) -> Answers:
 def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     """Describe the invalid answer and the accepted values, or the line that is not TOML."""
     message = str(error)
-    if line := re.search(r"\(at line (\d+), column \d+\)", message):
-        content = one_line(text.splitlines()[int(line[1]) - 1], 60)
-        return f"line {line[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
+    if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
+        content = one_line(text.splitlines()[int(line_match[1]) - 1], 60)
+        return (
+            f"line {line_match[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in "
+            "quotes"
+        )
     reason, _, path = message.partition(" - at `$.")
-    names = re.findall(r"\w+", path)
-    if not names:
+    path_names = re.findall(r"\w+", path)
+    if not path_names:
         return message
-    value: Any = record
-    for name in names:
-        value = value[int(name) if name.isdigit() else name]
-    field, number = names[-1], int(names[1]) + 1 if len(names) > 1 else 0
-    if isinstance(value, dict):
+    invalid_value: Any = record
+    for name in path_names:
+        invalid_value = invalid_value[int(name) if name.isdigit() else name]
+    field, number = path_names[-1], int(path_names[1]) + 1 if len(path_names) > 1 else 0
+    if isinstance(invalid_value, dict):
         return f"mistake {number}: {reason}"
-    accepted = ACCEPTED_VALUES.get(names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
-    if names[0] in ("quantities", "predictions"):
-        field = f"{names[0][0]}{number}"
-    place = f" of mistake {number}" if names[0] == "mistakes" else ""
-    return f"{field}{place} is {one_line(str(value), 60)!r}; give {accepted}"
+    accepted_text = ACCEPTED_VALUES.get(path_names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
+    if path_names[0] in ("quantities", "predictions"):
+        field = f"{path_names[0][0]}{number}"
+    place_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
+    return f"{field}{place_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
 
 
-def _as_record(form: dict[str, Any]) -> dict[str, Any]:
+def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     filled_form = _without_blanks(update_renamed_values(form))
     mistakes = filled_form.pop("mistake", ())
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
-    names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
+    quantity_names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
     predictions = msgspec.convert(filled_form.pop("predictions", {}), dict[str, Any])
     prediction_names = [f"p{number}" for number in range(1, MAX_PREDICTIONS + 1)]
     if unknown_fields := sorted(
-        {*quantities, *({"mistakes"} & filled_form.keys())} - set(names)
+        {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_names)
         | predictions.keys() - set(prediction_names)
     ):
         raise ValueError(
-            f"the field {unknown_fields[0]} is unknown; known fields: mistake, {', '.join(names)}"
+            f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
+            f"{', '.join(quantity_names)}"
         )
     return {
         **filled_form,
         "mistakes": mistakes,
-        "quantities": tuple(quantities.get(name) for name in names),
+        "quantities": tuple(quantities.get(name) for name in quantity_names),
         "predictions": tuple(predictions.get(name, "") for name in prediction_names)
         if predictions
         else (),
@@ -314,18 +318,19 @@ def update_renamed_values(value: Any) -> Any:
     """Replace names and values of answer forms and answer keys written before schema version 4."""
     if isinstance(value, dict):
         return {
-            update_renamed_values(key): update_renamed_values(part) for key, part in value.items()
+            update_renamed_values(key): update_renamed_values(element)
+            for key, element in value.items()
         }
     if isinstance(value, list):
-        return [update_renamed_values(part) for part in value]
+        return [update_renamed_values(element) for element in value]
     return _CHOICES.renamed.get(value, value) if isinstance(value, str) else value
 
 
 def _without_blanks(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_blanks(part) for key, part in value.items() if part != ""}
+        return {key: _without_blanks(element) for key, element in value.items() if element != ""}
     if isinstance(value, list):
-        return [part for part in map(_without_blanks, value) if part not in ("", {})]
+        return [element for element in map(_without_blanks, value) if element not in ("", {})]
     return value
 
 
@@ -350,15 +355,16 @@ def check_answers(answers: Answers) -> None:
             ("unit", mistake.units),
             ("value_unit", CORRECTIONS.get(student_mistake.parameter)),
         ):
-            value = getattr(student_mistake, field)
-            if value and choices is not None:
-                _require_choice(f"{student_mistake.kind}: {field}", value, choices)
+            chosen_name = getattr(student_mistake, field)
+            if chosen_name and choices is not None:
+                _require_choice(f"{student_mistake.kind}: {field}", chosen_name, choices)
         low, high = mistake.range
-        size = student_mistake.size_in_first_unit()
-        if size is not None and not low <= size <= high:
-            unit, limits = next(iter(mistake.units)), f"{low:g} to {high:g}"
+        size_in_first_unit = student_mistake.size_in_first_unit()
+        if size_in_first_unit is not None and not low <= size_in_first_unit <= high:
+            unit, limits_text = next(iter(mistake.units)), f"{low:g} to {high:g}"
             raise ValueError(
-                f"{student_mistake.kind}: size {size:g} is out of range ({limits} {unit})"
+                f"{student_mistake.kind}: size {size_in_first_unit:g} is out of range "
+                f"({limits_text} {unit})"
             )
 
 
@@ -414,14 +420,14 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     for mistake in answers.mistakes:
         size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
         value_units = CORRECTIONS.get(mistake.parameter, {})
-        value = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
+        value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
         from_text = "" if mistake.from_s is None else f"from {mistake.from_s:g} s"
         until_text = "" if mistake.until_s is None else f"until {mistake.until_s:g} s"
         details = (
             _format_number_with_unit(mistake.size, mistake.unit, size_units),
             mistake.when or f"{from_text} {until_text}".strip(),
             f"shown in {mistake.panel}" if mistake.panel else "",
-            f"{mistake.parameter} {value}".strip(),
+            f"{mistake.parameter} {value_text}".strip(),
         )
         yield mistake.kind, "; ".join(filter(None, details)) or EMPTY_CELL
     for question, answer in zip(
@@ -430,9 +436,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    for number, name in enumerate(answers.predictions, start=1):
-        if name:
-            yield f"Prediction p{number}", name
+    for number, range_name in enumerate(answers.predictions, start=1):
+        if range_name:
+            yield f"Prediction p{number}", range_name
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

@@ -25,11 +25,11 @@ BOUNDS = {
     r"(^|_)(ratio|factor)($|_)": (-MAX_RATIO, MAX_RATIO),
     r"_m$": (-MAX_LENGTH_M, MAX_LENGTH_M),
 }
-REMEDY = "Check the values in the log."
+CHECK_LOG_REMEDY = "Check the values in the log."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
-class _OutsideError(Exception):
+class _OutOfBoundsError(Exception):
     """A number in results is outside its bounds; the text contains the path of the number."""
 
 
@@ -39,8 +39,8 @@ def bounds_of(name: str) -> tuple[float, float]:
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
     """
-    matches = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
-    return next(matches, (-math.inf, math.inf))
+    matching_bounds = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
+    return next(matching_bounds, (-math.inf, math.inf))
 
 
 def within_bounds(results: T) -> T:
@@ -56,101 +56,109 @@ def within_bounds(results: T) -> T:
     """
     reasons: list[str] = []
     try:
-        checked: T = _check_value(results, None, "", reasons)
-    except _OutsideError as error:
-        raise ResultsError(f"the results are not usable: {error}", REMEDY) from error
-    if hasattr(checked, "missing"):
+        checked_results: T = _check_value(results, None, "", reasons)
+    except _OutOfBoundsError as error:
+        raise ResultsError(f"the results are not usable: {error}", CHECK_LOG_REMEDY) from error
+    if hasattr(checked_results, "missing"):
         removed_numbers = (
-            Unavailable(reason.partition(" ")[0], reason, REMEDY) for reason in reasons
+            Unavailable(reason.partition(" ")[0], reason, CHECK_LOG_REMEDY) for reason in reasons
         )
-        return replace(checked, missing=(*checked.missing, *removed_numbers))
+        return replace(checked_results, missing=(*checked_results.missing, *removed_numbers))
     return (
-        replace(checked, notes=(*checked.notes, *reasons)) if hasattr(checked, "notes") else checked
+        replace(checked_results, notes=(*checked_results.notes, *reasons))
+        if hasattr(checked_results, "notes")
+        else checked_results
     )
 
 
-def types_of(kind: Any) -> tuple[Any, ...]:
+def types_of(annotation: Any) -> tuple[Any, ...]:
     """Return the types that the annotation of a field accepts."""
-    if get_origin(kind) is Annotated:
-        return types_of(get_args(kind)[0])
-    if get_origin(kind) in (Union, UnionType):
-        return tuple(member for part in get_args(kind) for member in types_of(part))
-    return getattr(kind, "union_members", (kind,))
+    if get_origin(annotation) is Annotated:
+        return types_of(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return tuple(member for part in get_args(annotation) for member in types_of(part))
+    return getattr(annotation, "union_members", (annotation,))
 
 
-def _check_value(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
+def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
     if isinstance(value, float):
         low, high = bounds_of(path.rpartition(".")[2])
         if not math.isfinite(value):
-            raise _OutsideError(f"{path} is not a finite number")
+            raise _OutOfBoundsError(f"{path} is not a finite number")
         if not low <= value <= high:
-            raise _OutsideError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
+            raise _OutOfBoundsError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
         return value
     if isinstance(value, msgspec.Struct):
         return _check_struct(value, path, reasons)
     if isinstance(value, Mapping):
-        return _check_mapping(value, kind, path, reasons)
+        return _check_mapping(value, annotation, path, reasons)
     return _check_tuple(value, path, reasons) if isinstance(value, tuple) else value
 
 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
-        value_before, name = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
+        value_before, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            value_after = _check_value(value_before, field.type, name, reasons)
-        except _OutsideError as error:
+            value_after = _check_value(value_before, field.type, field_path, reasons)
+        except _OutOfBoundsError as error:
             if field.default is None:
                 reasons.append(str(error))
                 value_after = None
             else:
-                value_after = _make_unavailable(value_before, field.type, name, error, reasons)
+                value_after = _make_unavailable(
+                    value_before, field.type, field_path, error, reasons
+                )
         changes[field.name] = value_after
     return replace(value, **changes)
 
 
-def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str]) -> Any:
+def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons: list[str]) -> Any:
     value_type = next(
-        (get_args(member)[1] for member in types_of(kind) if len(get_args(member)) == 2), Any
+        (get_args(member)[1] for member in types_of(annotation) if len(get_args(member)) == 2), Any
     )
-    checked: dict[str, Any] = {}
+    checked_elements: dict[str, Any] = {}
     for key, element in value.items():
-        name = f"{path}.{key}"
+        element_path = f"{path}.{key}"
         try:
-            checked[key] = _check_value(element, value_type, name, reasons)
-        except _OutsideError as error:
+            checked_elements[key] = _check_value(element, value_type, element_path, reasons)
+        except _OutOfBoundsError as error:
             try:
-                checked[key] = _make_unavailable(element, value_type, name, error, reasons)
-            except _OutsideError:
+                checked_elements[key] = _make_unavailable(
+                    element, value_type, element_path, error, reasons
+                )
+            except _OutOfBoundsError:
                 reasons.append(str(error))
-    if not checked and any(getattr(meta, "min_length", 0) for meta in get_args(kind)[1:]):
-        raise _OutsideError(reasons[-1])
-    return checked
+    if not checked_elements and any(
+        getattr(meta, "min_length", 0) for meta in get_args(annotation)[1:]
+    ):
+        raise _OutOfBoundsError(reasons[-1])
+    return checked_elements
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
     # one number outside its bounds omits the whole tuple of numbers (a vector)
-    checked = []
+    checked_elements = []
     for element in value:
         try:
-            checked.append(_check_value(element, Any, path, reasons))
-        except _OutsideError as error:
+            checked_elements.append(_check_value(element, Any, path, reasons))
+        except _OutOfBoundsError as error:
             if not isinstance(element, msgspec.Struct):
                 raise
             reasons.append(str(error))
-    return tuple(checked)
+    return tuple(checked_elements)
 
 
 def _make_unavailable(
-    record: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
+    record: Any, annotation: Any, path: str, error: _OutOfBoundsError, reasons: list[str]
 ) -> Unavailable:
-    for member in types_of(kind):
-        if isinstance(member, type) and issubclass(member, Unavailable):
-            texts = {"what": path, "reason": str(error), "remedy": REMEDY}
+    for unavailable_type in types_of(annotation):
+        if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
+            texts = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
             other_fields = {
                 field.name: _check_value(getattr(record, field.name), field.type, path, reasons)
-                for field in fields(member)
+                for field in fields(unavailable_type)
                 if field.name not in texts and hasattr(record, field.name)
             }
-            return member(**texts, **other_fields)
+            return unavailable_type(**texts, **other_fields)
     raise error

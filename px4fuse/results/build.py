@@ -92,18 +92,18 @@ def sync_results(
 
 
 def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
-    whatif_result, sweep_start_index = analysis.whatif, analysis.sweep_start_index
+    summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
-            agreement=whatif_result.agreement,
-            evaluated_s=whatif_result.evaluated_s,
+            agreement=summaries.agreement,
+            evaluated_s=summaries.evaluated_s,
             asked=analysis.uses_estimates,
-            logged=whatif_result.logged,
-            replayed=whatif_result.replayed,
-            whatif=whatif_result.whatif[0] if sweep_start_index else None,
-            sweep=whatif_result.whatif[sweep_start_index:],
-            notes=whatif_result.notes,
+            logged=summaries.logged,
+            replayed=summaries.replayed,
+            whatif=summaries.whatif[0] if sweep_start_index else None,
+            sweep=summaries.whatif[sweep_start_index:],
+            notes=summaries.notes,
         )
     )
 
@@ -125,14 +125,16 @@ def loop_results(
     )
 
 
-def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
+def evaluation_results(
+    request: EvaluationRequest, evaluation: Evaluation
+) -> contract.EvaluationResults:
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
-            estimate=score.estimate_track.track(),
-            reference=score.reference_track.track(),
+            estimate=evaluation.estimate_track.track(),
+            reference=evaluation.reference_track.track(),
             provenance=provenance(command_line(request)),
-            **msgspec.structs.asdict(to_serializable(score)),
+            **msgspec.structs.asdict(to_serializable(evaluation)),
         )
     )
 

@@ -98,8 +98,8 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning with the maximum-likelihood estimate of a KF setting
-TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
+# Field of AxisTuning with the maximum-likelihood estimate, by KF setting
+ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 DiffSide = Literal["A", "B"]
@@ -343,29 +343,31 @@ def schema() -> dict[str, Any]:
 
 def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the JSON Schema of each type, and the definitions to which these schemas refer."""
-    kinds = dict.fromkeys(types)
+    record_types = dict.fromkeys(types)
     schemas: tuple[dict[str, Any], ...] = ()
     components: dict[str, Any] = {}
 
-    def describe(kind: Any) -> dict[str, Any]:
-        if kind is msgspec.UnsetType:  # an unset field is not written
+    def describe(union_type: Any) -> dict[str, Any]:
+        if union_type is msgspec.UnsetType:  # an unset field is not written
             return {"not": {}}
-        kinds.update(dict.fromkeys(kind.union_members))
-        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
+        record_types.update(dict.fromkeys(union_type.union_members))
+        return {
+            "anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in union_type.union_members]
+        }
 
     count = 0
     # repeated until describe adds no type from inside another type
-    while count < len(kinds):
-        count = len(kinds)
+    while count < len(record_types):
+        count = len(record_types)
         schemas, components = msgspec.json.schema_components(
-            list(kinds), schema_hook=describe, ref_template="#/$defs/{name}"
+            list(record_types), schema_hook=describe, ref_template="#/$defs/{name}"
         )
     return list(schemas[: len(types)]), components
 
 
-def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
+def to_plain(results: msgspec.Struct) -> dict[str, Any]:
     """Convert results to dicts, lists and numbers, with the field names of the JSON file."""
-    plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
+    plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_to_builtin)
     return plain_results
 
 
@@ -383,13 +385,13 @@ def round_number(value: float) -> float:
 
 def _round_numbers(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _round_numbers(child) for key, child in value.items()}
+        return {key: _round_numbers(element) for key, element in value.items()}
     if isinstance(value, list | tuple):
         return list(map(_round_numbers, value))
     return round_number(value) if isinstance(value, float) else value
 
 
-def _plain(value: Any) -> float | dict[str, Any]:
+def _to_builtin(value: Any) -> float | dict[str, Any]:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, float):
@@ -405,7 +407,7 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     ValueError
         The results contain a number that is not finite.
     """
-    plain_results = to_json_dict(results) if isinstance(results, msgspec.Struct) else results
+    plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
     rounded_results = _round_numbers(plain_results)
     return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 

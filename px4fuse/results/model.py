@@ -15,7 +15,7 @@ SCHEMA_VERSION = "4.0"
 # Libraries that affect the numbers in the results
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
-MAX_PERSON_LENGTH = 10_000
+MAX_STUDENT_NAME_LENGTH = 10_000
 
 Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
@@ -30,8 +30,8 @@ class Schema(Record, frozen=True):
 class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Student who made a report, with notes (Markdown) and the completed answer form."""
 
-    name: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
-    id: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
+    name: Annotated[str, Meta(max_length=MAX_STUDENT_NAME_LENGTH)] = ""
+    id: Annotated[str, Meta(max_length=MAX_STUDENT_NAME_LENGTH)] = ""
     notes: Annotated[str, Meta(max_length=MAX_NOTES_BYTES)] = ""
     answers: Answers | msgspec.UnsetType = msgspec.UNSET
 

@@ -15,7 +15,7 @@ from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
 from px4fuse.results.model import SCHEMA_VERSION
 
 # Maximum size of results (bytes), and of an integer in them (bits)
-MAX_RESULTS_BYTES, INTEGER_BITS = 5_000_000, 64
+MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
@@ -34,29 +34,35 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if len(data) > MAX_RESULTS_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
     try:
-        value = _clean_values(msgspec.json.decode(data))
+        decoded = _clean_values(msgspec.json.decode(data))
         json.loads(data, object_pairs_hook=_require_unique_keys)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
-    schema = value.get("schema") if isinstance(value, dict) else None
-    kind = RESULTS_BY_SCHEMA.get(str(schema.get("name"))) if isinstance(schema, dict) else None
-    if schema is None or kind is None:
+    schema = decoded.get("schema") if isinstance(decoded, dict) else None
+    results_type = (
+        RESULTS_BY_SCHEMA.get(str(schema.get("name"))) if isinstance(schema, dict) else None
+    )
+    if schema is None or results_type is None:
         raise ResultsError(f"{name} contains no results of px4fuse.")
     version, (major, minor) = str(schema.get("version")), SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        provenance = value.get("provenance")
-        writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader = one_line(str(writer), 60) if writer else "of that schema version"
+        provenance = decoded.get("provenance")
+        writer_version = provenance.get("px4fuse") if isinstance(provenance, dict) else None
+        reader_version = (
+            one_line(str(writer_version), 60) if writer_version else "of that schema version"
+        )
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
-            f"Create the report again, or read it with px4fuse {reader}.",
+            f"Create the report again, or read it with px4fuse {reader_version}.",
         )
     if int(version.partition(".")[2]) > int(minor):
-        value = _known_fields(value, kind)
+        decoded = _remove_unknown_fields(decoded, results_type)
     try:
-        results: Results = msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
+        results: Results = msgspec.convert(
+            decoded, results_type, dec_hook=decode_record_or_unavailable
+        )
     except msgspec.ValidationError as error:
         raise ResultsError(
             f"{name} does not follow the results schema: {one_line(str(error), 300)}."
@@ -64,21 +70,21 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     return results
 
 
-def _known_fields(value: Any, kind: Any) -> Any:
+def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
     """Remove fields that a newer minor version of the schema has added from decoded JSON."""
-    types = types_of(kind)
+    types = types_of(annotation)
     if isinstance(value, dict):
-        records = [record for record in types if hasattr(record, "__struct_fields__")]
-        field_types = {field.encode_name: field.type for r in records for field in fields(r)}
+        record_types = [record for record in types if hasattr(record, "__struct_fields__")]
+        field_types = {field.encode_name: field.type for r in record_types for field in fields(r)}
         value_type = next((args[1] for args in map(get_args, types) if len(args) == 2), Any)
         return {
-            key: _known_fields(child, field_types.get(key, value_type))
+            key: _remove_unknown_fields(child, field_types.get(key, value_type))
             for key, child in value.items()
-            if key in field_types or not records
+            if key in field_types or not record_types
         }
     if isinstance(value, list):
         item_type = next((args[0] for args in map(get_args, types) if args), Any)
-        return [_known_fields(element, item_type) for element in value]
+        return [_remove_unknown_fields(element, item_type) for element in value]
     return value
 
 
@@ -94,6 +100,6 @@ def _clean_values(value: Any) -> Any:
         return clean_text(value)
     if isinstance(value, dict):
         return {clean_text(key): _clean_values(child) for key, child in value.items()}
-    if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
+    if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
         raise ValueError("an integer has more than 64 bits")
     return list(map(_clean_values, value)) if isinstance(value, list) else value

@@ -21,7 +21,7 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 NO_MISTAKES = Mistakes()
-# Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity
+# Values of the PX4 parameters with which EKF2 fuses positions (GNSS: and velocities)
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
 PROFILE_WITH_VISION = 129
@@ -29,7 +29,7 @@ PROFILE_WITH_VISION = 129
 PROFILE_WITHOUT_VISION = 1
 # Version number of PX4 v1.16.0, the release whose topics are simulated
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
-HARDWARE = "px4fuse simulation"
+SIMULATION_HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
@@ -113,7 +113,7 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",
-        "ver_hw": HARDWARE,
+        "ver_hw": SIMULATION_HARDWARE,
         "ver_sw_release": PX4_RELEASE,
         **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
         **({ASSESSED_KEY: 1} if is_assessed else {}),

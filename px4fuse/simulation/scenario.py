@@ -11,12 +11,13 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 ScenarioKind = Literal["aisle", "loop", "outdoor"]
 YawMode = Literal["fixed", "follow"]
 KINDS: tuple[ScenarioKind, ...] = ("aisle", "loop", "outdoor")
-YAWS: tuple[YawMode, YawMode] = ("fixed", "follow")
+YAW_MODES: tuple[YawMode, YawMode] = ("fixed", "follow")
 
 # Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1
-# Duration (s) of acceleration and braking along the aisle, and of a corner of the loop
+# Duration (s) of acceleration and braking along the aisle
 START_STOP_S = 1.5
+# Duration (s) of a corner of the loop
 CORNER_DURATION_S = 2.0
 # Defaults of the scenario that depend on the kind of flight
 DEFAULTS_OF_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
@@ -153,8 +154,8 @@ class Scenario:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
-        if self.yaw is not None and self.yaw not in YAWS:
-            raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
+        if self.yaw is not None and self.yaw not in YAW_MODES:
+            raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAW_MODES)}.")
         for name, bounds in bounds_by_field(Scenario).items():
             bounds.check(getattr(self, name), bounds.cli_name)
         min_length_m = self.speed_m_s * (

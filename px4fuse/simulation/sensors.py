@@ -44,17 +44,19 @@ FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # Magnetic field (gauss, NED) at HOME_POSITION
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
-# White noise (1 σ, gauss) of the magnetometer, and measurement rate (Hz)
+# White noise (1 σ, gauss) of the magnetometer
 SIGMA_MAGNETOMETER_GAUSS = 0.02
+# Measurement rate (Hz) of the magnetometer
 MAGNETOMETER_RATE_HZ = 14.0
-# White noise (1 σ, m) of the barometer, and measurement rate (Hz)
+# White noise (1 σ, m) of the barometer
 SIGMA_BAROMETER_M = 0.4
+# Measurement rate (Hz) of the barometer
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_M = 0.03
 # Time constant (s) with which EKF2's heading follows a compass error that starts in flight
 HEADING_TIME_CONSTANT_S = 3.0
-# Range of the periods (s) of the sines that are the slow attitude and height errors
+# Range of the periods (s) of the sines whose sum is the slow attitude or height error
 SLOW_ERROR_PERIODS_S = (20.0, 60.0)
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200

@@ -8,11 +8,12 @@ import numpy as np
 from px4fuse.core.arrays import BoolArray
 from px4fuse.trajectory.model import Trajectory
 
-# Maximum rotation (rad) of a constant orientation: rounding of the digits in a file
+# Maximum rotation (rad) in a constant orientation, from rounded digits in a file
 MAX_CONSTANT_ROTATION_RAD = 1e-6
 # Minimum number of poses, and minimum motion (m), for a constant orientation
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
-# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference in that time
+# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference during a frozen
+# pose
 MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
 # Minimum constant rotation (rad) between orientations of different body axes
 MIN_BODY_ROTATION_RAD = np.radians(30.0)

@@ -15,7 +15,7 @@ Method = Literal["interpolate", "nearest"]
 
 # Default of the maximum gap in the reference that is interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum interval (s) of a reference whose poses are paired instead of interpolated
+# Minimum pose interval (s) of a reference that is paired with the estimate, not interpolated
 MIN_SPARSE_INTERVAL_S = 2.0
 # Minimum value (s) of the default maximum gap in the reference that is interpolated
 MIN_GAP_LIMIT_S = 0.1

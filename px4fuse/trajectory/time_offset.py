@@ -41,23 +41,24 @@ MAX_CANDIDATES = 12
 SEARCH_WINDOW_S = 0.5
 # Half-width (s) of the least-squares search around the first result
 FINE_SEARCH_WINDOW_S = 0.1
-# Minimum distance (s) between two correlation peaks
+# Minimum distance (s) between two peaks of the speed correlation
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of another offset's residual (RMS) to the best residual for an unambiguous result:
-# 95 % limit of an F-test with 80 independent residuals, half a minute of flight
+# Minimum ratio of the residual (RMS) at another time offset to the best residual, for an
+# unambiguous time offset: 95 % limit of an F-test with 80 independent residuals, half a minute of
+# flight
 MIN_SECOND_PEAK_RATIO = 1.2
-# Maximum number of poses in the least-squares fit
+# Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
-# Maximum ratio of the residual to the extent of the motion for accepting a fit
+# Maximum ratio of residual to extent of the motion for accepting a fit of the time offset
 MAX_MISFIT = 0.5
-# Ratio of the residual to the extent of the motion below which two fits are equally good
+# Ratio of residual to extent of the motion below which two fits of the time offset are equally good
 MIN_MISFIT = 1e-3
-# Minimum free velocity (RMS) as fraction of the speed: this component, which a similarity transform
-# cannot explain, determines the time offset
+# Minimum free velocity (RMS) as fraction of the speed: the free velocity is the part that a
+# similarity transform cannot explain
 MIN_FREE_SPEED_FRACTION = 0.05
-# Minimum correlation of the free velocities of both trajectories, which excludes noise
+# Minimum correlation of the free velocities of both trajectories: noise is not correlated
 MIN_FREE_CORRELATION = 0.5
 # Window of the long-run variance of the likelihood score, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4

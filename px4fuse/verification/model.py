@@ -79,5 +79,5 @@ class Verification:
     @property
     def outcome(self) -> str:
         """Status of the numbers, or "page differs" if only pages of the report differ."""
-        differ = self.status == "verified" and self.page_status == "differ"
-        return "page differs" if differ else self.status
+        has_different_pages = self.status == "verified" and self.page_status == "differ"
+        return "page differs" if has_different_pages else self.status

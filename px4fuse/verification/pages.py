@@ -87,12 +87,12 @@ _FEATURE_NAMES = {
     "/XObject": "an image or form object",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
-_TOKEN = re.compile(
+_TOKEN_PATTERN = re.compile(
     r"\(((?:[^\\()]|\\.|\((?:[^\\()]|\\.)*+\))*+)\)|<([0-9A-Fa-f]*)>"
     r"|(<<|>>|/?[^\0\t\n\f\r ()<>\[\]{}/%]+|[^\0\t\n\f\r ])",
     re.DOTALL,
 )
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
+_NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _ESCAPE = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
 _ESCAPED_CHARACTERS = {
     "n": "\n",
@@ -105,7 +105,7 @@ _ESCAPED_CHARACTERS = {
     "\r\n": "",
 }
 # PDF drawing operators with coordinates, and index of the first coordinate among their operands
-_FIRST_COORDINATE = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
+_FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
 # Entry of a font's ToUnicode map: glyph number and its characters (UTF-16), in hexadecimal digits
 _TO_UNICODE_ENTRY = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
@@ -140,7 +140,7 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
             submitted_pdf, redrawn_pdf = map(open_strictly, (submitted, redrawn))
             page_differences = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
             differences = [
-                *(PageDifference(0, ambiguity, True) for ambiguity in _ambiguities(submitted)),
+                *(PageDifference(0, ambiguity, True) for ambiguity in _find_ambiguities(submitted)),
                 *islice(page_differences, MAX_LISTED_DIFFERENCES),
             ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
@@ -161,30 +161,32 @@ class _PdfComparison:
     is_same_text: TextComparison
     # object number and generation in the submitted PDF, and object number in the redrawn PDF
     compared_pairs: set[tuple[int, int, int]] = field(default_factory=set)
-    # parents of pages, which are compared after the document catalogue
+    # parents of pages in both PDFs, to be compared after the document catalogue
     parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page, by their names in the page content
     fonts: Mapping[str, Any] = field(default_factory=dict)
-    # number of compared values, which is limited because a malicious PDF may contain very many
+    # number of compared values: a malicious PDF may contain millions
     value_count: int = 0
 
     def differences(
         self, submitted: pypdf.PdfReader, redrawn: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
-        pages = [_page_references(reader) for reader in (submitted, redrawn)]
-        for number, (page, expected) in enumerate(zip_longest(*pages), start=1):
-            if page is None or expected is None:
-                fault = "the page is missing"
-                if expected is None:
-                    fault = f"px4fuse draws only {len(pages[1])} pages"
-                yield PageDifference(number, fault)
+        pages = [_get_page_references(reader) for reader in (submitted, redrawn)]
+        for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
+            if submitted_page is None or redrawn_page is None:
+                description = "the page is missing"
+                if redrawn_page is None:
+                    description = f"px4fuse draws only {len(pages[1])} pages"
+                yield PageDifference(page_number, description)
                 return
-            self.fonts = resolve_reference(expected.get_object()["/Resources"].get("/Font", {}))
-            yield from self._compare(page, expected, "/Page", number)
+            self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
+            yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
         for key in ("/Info", "/Root"):
-            value, expected = (dict.get(reader.trailer, key) for reader in (submitted, redrawn))
-            yield from self._compare(value, expected, key, 0)
+            submitted_value, redrawn_value = (
+                dict.get(reader.trailer, key) for reader in (submitted, redrawn)
+            )
+            yield from self._compare(submitted_value, redrawn_value, key, 0)
         for pair in self.parent_pairs:
             yield from self._compare(*pair, 0)
         # programs that support PDF 1.4 and PDF 1.5 read different cross-reference tables
@@ -219,7 +221,7 @@ class _PdfComparison:
                     page, f"the type of the PDF entry {key} differs from the redrawn report", True
                 )
             elif isinstance(redrawn_value, DictionaryObject):
-                yield from self._dictionaries(
+                yield from self._compare_dictionaries(
                     submitted_value, redrawn_value, key, page, remaining_values
                 )
             elif isinstance(redrawn_value, ArrayObject):
@@ -237,7 +239,7 @@ class _PdfComparison:
                 description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
                 yield PageDifference(page, description)
 
-    def _dictionaries(
+    def _compare_dictionaries(
         self,
         submitted_dictionary: DictionaryObject,
         redrawn_dictionary: DictionaryObject,
@@ -265,7 +267,7 @@ class _PdfComparison:
         if isinstance(submitted_dictionary, StreamObject) and isinstance(
             redrawn_dictionary, StreamObject
         ):
-            yield from self._streams(submitted_dictionary, redrawn_dictionary, key, page)
+            yield from self._compare_streams(submitted_dictionary, redrawn_dictionary, key, page)
 
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
         if _pdf_type_of(redrawn_value) is float:
@@ -282,11 +284,11 @@ class _PdfComparison:
             return True
         return self.is_same_text(*texts)
 
-    def _streams(
+    def _compare_streams(
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
     ) -> Iterator[PageDifference]:
-        kind = redrawn_stream.get("/Type")
-        if kind == "/EmbeddedFile":  # the attached results are compared as numbers
+        stream_type = redrawn_stream.get("/Type")
+        if stream_type == "/EmbeddedFile":  # the attached results are compared as numbers
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
@@ -294,69 +296,78 @@ class _PdfComparison:
                 page, f"the compression of the PDF entry {key} is not supported", True
             )
             return
-        data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
-        if data == redrawn_data or (
-            kind == "/Metadata" and _xmp_metadata(data) == _xmp_metadata(redrawn_data)
+        submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
+        if submitted_data == redrawn_data or (
+            stream_type == "/Metadata"
+            and _xmp_metadata(submitted_data) == _xmp_metadata(redrawn_data)
         ):
             return
-        is_drawing = key == "/Contents" or kind == "/Pattern"
-        if not is_drawing or len(data) > MAX_CONTENT_RATIO * len(redrawn_data):
+        is_drawing = key == "/Contents" or stream_type == "/Pattern"
+        if not is_drawing or len(submitted_data) > MAX_CONTENT_RATIO * len(redrawn_data):
             yield PageDifference(page, f"the content of {key} differs from the redrawn report")
-        elif description := self._describe_operation_difference(data, redrawn_data):
+        elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield PageDifference(page, description)
 
     def _describe_operation_difference(self, submitted: bytes, redrawn: bytes) -> str:
         """Describe the first drawing operation of a page that differs; "" if there is none."""
         operation_lists = map(_drawing_operations, (submitted, redrawn))
-        font = ""
-        for number, operations in enumerate(
+        font_name = ""
+        for operation_number, operations in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
         ):
-            (submitted_operator, submitted_operands), (operator, redrawn_operands) = operations
-            if operator == "Tf":
-                font = str(redrawn_operands[0])
+            (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = (
+                operations
+            )
+            if redrawn_operator == "Tf":
+                font_name = str(redrawn_operands[0])
             if operations[0] == operations[1] or (
-                submitted_operator == operator
-                and _has_near_operands(operator, submitted_operands, redrawn_operands)
+                submitted_operator == redrawn_operator
+                and _has_near_operands(redrawn_operator, submitted_operands, redrawn_operands)
             ):
                 continue
-            if {submitted_operator, operator} <= _TEXT_OPERATORS:
-                texts = [self._text(operands, font) for _, operands in operations]
+            if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
+                texts = [self._decode_text(operands, font_name) for _, operands in operations]
                 kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
                 is_narrow = max(kerning, default=0.0) < MAX_KERNING
                 if texts[0] != texts[1] and is_narrow and self.is_same_text(*texts):
                     continue
                 submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
                 return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
-            expected = one_line(operator, 9)
-            return f"drawing operation {number} differs from px4fuse's operation {expected}"
+            operator_text = one_line(redrawn_operator, 9)
+            return (
+                f"drawing operation {operation_number} differs from px4fuse's operation "
+                f"{operator_text}"
+            )
         return ""
 
-    def _text(self, operands: tuple[Operand, ...], font: str) -> str:
+    def _decode_text(self, operands: tuple[Operand, ...], font: str) -> str:
         """Decode the text of a Tj or TJ operation with the font's ToUnicode map; ? if unknown."""
-        cmap = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
+        to_unicode = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         text_by_glyph = {
-            int(glyph, 16): bytes.fromhex(text) for glyph, text in _TO_UNICODE_ENTRY.findall(cmap)
+            int(glyph, 16): bytes.fromhex(utf16_text)
+            for glyph, utf16_text in _TO_UNICODE_ENTRY.findall(to_unicode)
         }
-        glyphs = b"".join(operand for operand in operands if isinstance(operand, bytes))
-        numbers = struct.unpack(f">{len(glyphs) // 2}H", glyphs[: len(glyphs) // 2 * 2])
-        text = b"".join(text_by_glyph.get(number, b"\0?") for number in numbers)
-        return text.decode("utf-16-be", "replace")
+        glyph_bytes = b"".join(operand for operand in operands if isinstance(operand, bytes))
+        glyph_numbers = struct.unpack(
+            f">{len(glyph_bytes) // 2}H", glyph_bytes[: len(glyph_bytes) // 2 * 2]
+        )
+        utf16_text = b"".join(text_by_glyph.get(number, b"\0?") for number in glyph_numbers)
+        return utf16_text.decode("utf-16-be", "replace")
 
 
-def _ambiguities(pdf: bytes) -> Iterator[str]:
+def _find_ambiguities(pdf: bytes) -> Iterator[str]:
     """Describe structures of a PDF that make different programs read different objects."""
-    end = _END_OF_FILE.search(pdf[-1024:])
-    if end is None:
+    end_match = _END_OF_FILE.search(pdf[-1024:])
+    if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
         # the end of the file must refer to the first cross-reference table
         table_start = pdf.find(b"endobj") + len(b"endobj")
-        if pdf[table_start : int(end[1])].strip():
+        if pdf[table_start : int(end_match[1])].strip():
             yield "the file has a second table of objects"
 
 
-def _page_references(reader: pypdf.PdfReader) -> list[Any]:
+def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
     """Return references to the pages of a page tree with one level, as px4fuse writes it."""
     tree: Any = reader.root_object["/Pages"]
     return [*list.__iter__(tree["/Kids"])]
@@ -374,12 +385,12 @@ def _pdf_type_of(value: Any) -> type:
 
 def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
     """Return the keys of a PDF dictionary that are compared; a null value is ignored."""
-    keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
+    compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
-        keys -= _COMPRESSION_KEYS
+        compared_keys -= _COMPRESSION_KEYS
     if key == "/Info":
-        keys -= _WRITER_KEYS
-    return keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else keys
+        compared_keys -= _WRITER_KEYS
+    return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
 def _xmp_metadata(data: bytes) -> str:
@@ -395,15 +406,15 @@ def _xmp_metadata(data: bytes) -> str:
 def _drawing_operations(content: bytes) -> Iterator[Operation]:
     """Parse the content of a PDF page; yield each drawing operator with its operands."""
     operands: list[Operand] = []
-    for match in _TOKEN.finditer(content.decode("latin-1")):
+    for match in _TOKEN_PATTERN.finditer(content.decode("latin-1")):
         literal, digits, token = match.groups("")
         if not token:
             operands.append(
                 bytes.fromhex(digits + "0" * (len(digits) % 2))
                 if digits
-                else _ESCAPE.sub(_unescaped, literal).encode("latin-1")
+                else _ESCAPE.sub(_unescape, literal).encode("latin-1")
             )
-        elif _NUMBER.fullmatch(token):
+        elif _NUMBER_PATTERN.fullmatch(token):
             operands.append(float(token))
         elif token[0] in "/[]<>{}":
             operands.append(token)
@@ -413,7 +424,7 @@ def _drawing_operations(content: bytes) -> Iterator[Operation]:
     yield "", tuple(operands)
 
 
-def _unescaped(match: re.Match[str]) -> str:
+def _unescape(match: re.Match[str]) -> str:
     escaped = match[1]
     if escaped is None:  # an end of line in a PDF string is a line feed
         return "\n"
@@ -428,15 +439,17 @@ def _has_near_operands(
     """Return True if the operands of a drawing operator are equal within the tolerances."""
     if len(submitted_operands) != len(redrawn_operands):
         return False
-    first_coordinate = _FIRST_COORDINATE.get(operator, len(redrawn_operands))
-    for index, (operand, expected) in enumerate(
+    first_coordinate_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
+    for index, (submitted_operand, redrawn_operand) in enumerate(
         zip(submitted_operands, redrawn_operands, strict=True)
     ):
-        tolerance = COORDINATE_TOLERANCE_PT if index >= first_coordinate else NUMBER_TOLERANCE
-        if operand != expected and not (
-            isinstance(operand, float)
-            and isinstance(expected, float)
-            and math.isclose(operand, expected, rel_tol=NUMBER_TOLERANCE, abs_tol=tolerance)
+        tolerance = COORDINATE_TOLERANCE_PT if index >= first_coordinate_index else NUMBER_TOLERANCE
+        if submitted_operand != redrawn_operand and not (
+            isinstance(submitted_operand, float)
+            and isinstance(redrawn_operand, float)
+            and math.isclose(
+                submitted_operand, redrawn_operand, rel_tol=NUMBER_TOLERANCE, abs_tol=tolerance
+            )
         ):
             return False
     return True

@@ -76,7 +76,7 @@ PYPDF_LIMITS: dict[str, Any] = {
 # PDF stream filters that _check_file can test for decompression bombs
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
-_STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
+_STREAM_START = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
 # pypdf must not print warnings about damaged PDFs on the terminal
@@ -84,14 +84,16 @@ logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
 def read_report(pdf: bytes, name: str) -> ReportedResults:
-    """Read the compare or loop results of a submitted report; errors contain the file ``name``.
+    """Read the results of compare or loop that a submitted report contains.
+
+    ``name`` is the file name for messages.
 
     Raises
     ------
     ResultsError
-        The PDF is not a report, or the results contain only the EKF2 aiding sources.
+        The PDF is not a report, or is a report without KF results.
     """
-    results = attached_results(pdf, name)
+    results = read_attached_results(pdf, name)
     if isinstance(results, ReportedResults):
         return results
     reason = f"the attached {RESULTS_NAME} contains no results of compare or loop"
@@ -100,7 +102,7 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
     raise ResultsError(f"{one_line(name, 200)}: {reason}.")
 
 
-def attached_results(pdf: bytes, name: str) -> Results:
+def read_attached_results(pdf: bytes, name: str) -> Results:
     """Read the results attached to a report PDF; control characters are removed from texts.
 
     Raises
@@ -117,7 +119,7 @@ def attached_results(pdf: bytes, name: str) -> Results:
                 raise ResultsError(_ENCRYPTED_REASON)
             if not 0 < len(reader.pages) <= MAX_PAGES:
                 raise ResultsError(f"the PDF has no pages, or more than {MAX_PAGES} pages.")
-            return read_results(_attachment(reader), f"the attached {RESULTS_NAME}")
+            return read_results(_read_attachment(reader), f"the attached {RESULTS_NAME}")
     except ResultsError as error:
         reason, remedy = f"{error.reason}.", error.remedy
     except (LimitReachedError, RecursionError, MemoryError):
@@ -151,9 +153,11 @@ def _check_file(pdf: bytes) -> None:
             raise ResultsError(reason)
     # every stream is inflated and discarded here, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
-    for match in _STREAM.finditer(pdf):
+    for stream_match in _STREAM_START.finditer(pdf):
         # each occurrence of the word "stream" is tested, also inside of the data of a stream
-        inflated_bytes = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
+        inflated_bytes = _inflated_bytes(
+            pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
+        )
         remaining_bytes -= inflated_bytes
         if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError(
@@ -221,23 +225,32 @@ def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObjec
             remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
-def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[str]:
+def _foreign_features(dictionary: DictionaryObject, needs_click: bool) -> Iterator[str]:
     """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
-    yield from (key[1:] for key in value if _ACTIVE_KEYS.fullmatch(key))
-    action, kind = _pdf_name(value.get("/S")) or "", _pdf_name(value.get("/Type"))
+    yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
+    action, dictionary_type = (
+        _pdf_name(dictionary.get("/S")) or "",
+        _pdf_name(dictionary.get("/Type")),
+    )
     if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not needs_click:
         yield "an action that opens an address"
-    is_stream = isinstance(value, StreamObject)
-    if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (is_stream and "/F" in value):
+    is_stream = isinstance(dictionary, StreamObject)
+    if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
+        is_stream and "/F" in dictionary
+    ):
         yield "a reference to another file"
     if is_stream:
-        filters = resolve_reference(value.get("/Filter"))
+        filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
-        names = [_pdf_name(filter_object) for filter_object in filters if filter_object is not None]
-        if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) != len(names):
-            filter_names = " ".join(name or "?" for name in names[:3])
+        all_filter_names = [
+            _pdf_name(filter_object) for filter_object in filters if filter_object is not None
+        ]
+        if not _ALLOWED_FILTERS.issuperset(all_filter_names) or len(set(all_filter_names)) != len(
+            all_filter_names
+        ):
+            filter_names = " ".join(name or "?" for name in all_filter_names[:3])
             yield f"a stream with unsupported compression ({one_line(filter_names, 60)})"
 
 
@@ -251,40 +264,44 @@ def _pdf_name(value: object) -> str | None:
     return str(value) if isinstance(value, str) else None
 
 
-def _attachment(reader: pypdf.PdfReader) -> bytes:
+def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the file attached to a report: one file with the name RESULTS_NAME."""
-    files: list[DictionaryObject] = []
+    file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
-    for value, needs_click in _all_dictionaries(reader):
-        features.update(_foreign_features(value, needs_click))
-        contents: list[object] = [value] if _pdf_name(value.get("/Type")) == "/EmbeddedFile" else []
-        if "/EF" in value:
-            files.append(value)
-            versions = resolve_reference(value.get("/EF"))
-            contents += versions.values() if isinstance(versions, DictionaryObject) else ()
-        objects = map(resolve_reference, contents)
+    for dictionary, needs_click in _all_dictionaries(reader):
+        features.update(_foreign_features(dictionary, needs_click))
+        embedded_files: list[object] = (
+            [dictionary] if _pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
+        )
+        if "/EF" in dictionary:
+            file_specifications.append(dictionary)
+            file_versions = resolve_reference(dictionary.get("/EF"))
+            embedded_files += (
+                file_versions.values() if isinstance(file_versions, DictionaryObject) else ()
+            )
+        objects = map(resolve_reference, embedded_files)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
     if features:
         feature_names = ", ".join(sorted(features))
         raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")
-    if not files and not streams:
+    if not file_specifications and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
             "printed to PDF, which removes attachments. Hand in the original file."
         )
-    if len(files) != 1 or len(streams) != 1:
+    if len(file_specifications) != 1 or len(streams) != 1:
         raise ResultsError(
             "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
         )
-    (file,), (stream,) = files, streams.values()
-    keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file.keys()
-    names = {str(resolve_reference(file.get(key))) for key in keys}
-    if names != {RESULTS_NAME}:
-        name_text = one_line(" / ".join(sorted(names)), 80)
+    (file_specification,), (stream,) = file_specifications, streams.values()
+    keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specification.keys()
+    file_names = {str(resolve_reference(file_specification.get(key))) for key in keys}
+    if file_names != {RESULTS_NAME}:
+        name_text = one_line(" / ".join(sorted(file_names)), 80)
         raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
-    data = bytes(stream.get_data())
-    if len(data) > MAX_ATTACHMENT_BYTES:
+    attached_bytes = bytes(stream.get_data())
+    if len(attached_bytes) > MAX_ATTACHMENT_BYTES:
         limit_mb = MAX_ATTACHMENT_BYTES // 1_000_000
         raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit_mb} MB.")
-    return data
+    return attached_bytes

@@ -29,31 +29,32 @@ from px4fuse.results.contract import (
     LoopResults,
     ReportedResults,
     to_json,
-    to_json_dict,
+    to_plain,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verification
 from px4fuse.verification.pages import TextComparison, compare_pages
 
-ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
+ASK_ADVICE = "Ask the author how the report was made, and for its log and all other input files."
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
 # Minimum KF prediction step DT (s) of a report: for ten minutes of flight, 60,000 steps take half a
 # minute
 MIN_DT_S = 0.01
-ORIGINAL_PDF_ADVICE = "Ask for the PDF that px4fuse wrote."
+ORIGINAL_PDF_ADVICE = "Ask the author of the report for the PDF that px4fuse wrote."
 LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Relative tolerance of numbers: the results of four OpenBLAS kernels differ by at most 3e-8 (six
-# flights)
+# Relative tolerance of recorded numbers: the results of four OpenBLAS kernels differ by at most
+# 3e-8 (six flights)
 RELATIVE_TOLERANCE = 1e-6
-# Absolute tolerance of numbers near zero
+# Absolute tolerance of recorded numbers near zero
 ABSOLUTE_TOLERANCE = 1e-9
-# Relative tolerance of estimates. The minimum of the cost is flat: if the cost differs in its 12th
-# digit, the ends of the 95 % interval differ in the 4th digit. Pages print up to three digits
+# Relative tolerance of recorded estimates. The minimum of the cost is flat: if the cost differs in
+# its 12th digit, the ends of the 95 % interval differ in the 4th digit. Pages print up to three
+# digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Absolute tolerance of estimates near zero
+# Absolute tolerance of recorded estimates near zero
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Beginnings of the paths of estimates in the results
 ESTIMATE_PATHS = (
@@ -73,19 +74,19 @@ ESTIMATE_PATHS = (
 ITERATIONS_FIELD = "iterations"
 # Maximum difference of two numbers of iterations: the solver stops at another step on other
 # processors
-MAX_MORE_ITERATIONS = 2
+MAX_ITERATION_DIFFERENCE = 2
 # Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
-MAX_LISTED_PAGES = 5
+MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
 # Factors between a result and its printed number: 1, per cent, thousandths (mm, ms)
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
 # Maximum number of lines of a student's notes in a report that px4fuse draws again: a page has 60
 MAX_NOTES_LINES = 5_000
-_NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
+_NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# Results of the new run, and a function that draws the report of these results
+# Results of the new run, and a function that draws a report with these results
 Recomputed = tuple[ReportedResults, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
@@ -159,8 +160,8 @@ def split_track(source: str) -> tuple[str, str]:
     """Split ``LOG:vio`` into the file ``LOG`` and the track ``:vio``, which may be missing."""
     from px4fuse.loop.tracks import TRACK_NAMES  # noqa: PLC0415
 
-    name, separator, track = source.rpartition(":")
-    return (name, f":{track}") if separator and track in TRACK_NAMES else (source, "")
+    file_name, separator, track = source.rpartition(":")
+    return (file_name, f":{track}") if separator and track in TRACK_NAMES else (source, "")
 
 
 def _repeat_comparison(
@@ -236,20 +237,23 @@ def verify(
     recompute : callable
         Function that repeats the analysis.
     """
-    version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
-    if version != own_version:
-        version = one_line(version, 40)
-        reason = f"the report was made with px4fuse {version}; this is px4fuse {own_version}"
-        return cannot_verify(reason, f"Verify the report with px4fuse {version}.")
-    name = one_line(log_name(results), 80) or "the log"
+    report_version, installed_version = results.provenance.px4fuse, metadata.version("px4fuse")
+    if report_version != installed_version:
+        report_version = one_line(report_version, 40)
+        reason = (
+            f"the report was made with px4fuse {report_version}; the installed version is "
+            f"{installed_version}"
+        )
+        return cannot_verify(reason, f"Verify the report with px4fuse {report_version}.")
+    log_file_name = one_line(log_name(results), 80) or "the log"
     if not logs:
-        return cannot_verify(NO_LOG_REASON, f"Add {name} to --logs.", name)
+        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
-        remedy = f"If the log is yours, add {name} to --logs."
-        return Verification("other log", (reason,), False, remedy=remedy, missing=name)
+        remedy = f"If the log is yours, add {log_file_name} to --logs."
+        return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_ADVICE)
@@ -269,16 +273,16 @@ def _verify_with_log(
     submitted_results: ReportedResults,
     pdf: bytes,
     new_results: ReportedResults,
-    draw: Callable[[], bytes],
+    draw_report: Callable[[], bytes],
 ) -> Verification:
-    redrawn_pdf = draw()
+    redrawn_pdf = draw_report()
     if redrawn_pdf == pdf:
         reason = "a new run on the log gives an identical PDF"
         return Verification(
             "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
         )
     mismatches, is_same_number, value_count = compare_results(
-        to_json_dict(submitted_results), to_json_dict(new_results)
+        to_plain(submitted_results), to_plain(new_results)
     )
     reasons = [
         f"all {value_count} values agree with a new run on the log (within "
@@ -291,37 +295,52 @@ def _verify_with_log(
             f"{len(mismatches)} of {value_count} values differ from a new run on the log: {paths}"
         ]
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
-    pages = compare_pages(pdf, redrawn_pdf, is_same_text)
-    is_foreign = any(difference.is_structural for difference in pages)
-    own_libraries = new_results.provenance.libraries.items()
-    other_libraries = (
-        {*submitted_results.provenance.libraries.items()} - {*own_libraries} if pages else ()
+    page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)
+    is_from_other_program = any(difference.is_structural for difference in page_differences)
+    own_versions = new_results.provenance.libraries.items()
+    other_versions = (
+        {*submitted_results.provenance.libraries.items()} - {*own_versions}
+        if page_differences
+        else ()
     )
     # pages of another program, or drawn with other library versions, may differ anyway
-    is_comparable = not (is_foreign or other_libraries)
+    is_comparable = not (is_from_other_program or other_versions)
     page_status: PageStatus = "same"
-    if pages:
+    if page_differences:
         page_status = "differ" if is_comparable else "not compared"
     status: Status = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
-    page_sentences = [difference.sentence for difference in pages[:MAX_LISTED_PAGES]]
-    if len(pages) > MAX_LISTED_PAGES:
-        page_sentences.append(f"the PDF has {len(pages) - MAX_LISTED_PAGES} more differences")
+    page_sentences = [
+        difference.sentence for difference in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]
+    ]
+    if len(page_differences) > MAX_LISTED_PAGE_DIFFERENCES:
+        page_sentences.append(
+            f"the PDF has {len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES} more differences"
+        )
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":
         reasons = page_sentences + reasons
     else:
         reasons += page_sentences
-    remedy = ORIGINAL_PDF_ADVICE if is_foreign else ""
-    if other_libraries:  # other library versions may draw other pages
-        versions = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
-        reasons.append(f"the report was made with {versions}; this computer has other versions")
-        remedy = remedy or f"Verify the report with {versions}."
+    remedy = ORIGINAL_PDF_ADVICE if is_from_other_program else ""
+    if other_versions:  # other library versions may draw other pages
+        versions_text = one_line(", ".join(map(" ".join, sorted(other_versions))), 300)
+        reasons.append(
+            f"the report was made with {versions_text}; this computer has other versions"
+        )
+        remedy = remedy or f"Verify the report with {versions_text}."
     reasons += [LIMIT_NOTE] * (status == "verified")
     listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
     return Verification(
-        status, tuple(reasons), True, listed_mismatches, page_status, pages, redrawn_pdf, remedy
+        status,
+        tuple(reasons),
+        True,
+        listed_mismatches,
+        page_status,
+        page_differences,
+        redrawn_pdf,
+        remedy,
     )
 
 
@@ -357,30 +376,30 @@ def compare_results(
     # or frame alignment
     is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
-    pairs = {
+    pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
         for path in {**new_values, **recorded_values}
         if not path.startswith(MACHINE_PATHS)
     }
     is_near_by_path = {
-        path: _is_near(path, *pair, is_estimate_everywhere or path.startswith(ESTIMATE_PATHS))
-        for path, pair in pairs.items()
-        if all(map(is_number, pair))
+        path: _is_near(path, *value_pair, is_estimate_everywhere or path.startswith(ESTIMATE_PATHS))
+        for path, value_pair in pair_by_path.items()
+        if all(map(is_number, value_pair))
     }
-    near_pairs = (pairs[path] for path, is_near in is_near_by_path.items() if is_near)
+    near_pairs = (pair_by_path[path] for path, is_near in is_near_by_path.items() if is_near)
     unequal_pairs = tuple((float(a), float(b)) for a, b in near_pairs if a != b)
     is_same_number = partial(is_same_number_rounded, unequal_pairs)
     wrong_paths = [path for path, is_near in is_near_by_path.items() if not is_near]
     wrong_paths += [
         path
-        for path in pairs
-        if path not in is_near_by_path and not _is_same(*pairs[path], is_same_number)
+        for path in pair_by_path
+        if path not in is_near_by_path and not _is_same(*pair_by_path[path], is_same_number)
     ]
     mismatches = (
-        Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, pairs[path]))
+        Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, pair_by_path[path]))
         for path in wrong_paths
     )
-    return tuple(mismatches), is_same_number, len(pairs)
+    return tuple(mismatches), is_same_number, len(pair_by_path)
 
 
 # Placeholder of a value that only one of two results contains
@@ -398,8 +417,8 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     if not isinstance(value, Mapping):
         yield path, value
         return
-    for key, part in value.items():
-        yield from flatten(part, f"{path}.{key}" if path else f"{key}")
+    for key, element in value.items():
+        yield from flatten(element, f"{path}.{key}" if path else f"{key}")
 
 
 def is_number(value: object) -> bool:
@@ -409,7 +428,7 @@ def is_number(value: object) -> bool:
 
 def _is_near(path: str, submitted_number: float, new_number: float, is_estimate: bool) -> bool:
     if isinstance(new_number, int):
-        tolerance: float = MAX_MORE_ITERATIONS * path.endswith(ITERATIONS_FIELD)
+        tolerance: float = MAX_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
     elif is_estimate:
         tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:
@@ -434,9 +453,12 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     if first_text == second_text:
         return True
     # the split lists contain texts and numbers in turn
-    pieces, other_pieces = _NUMBER.split(first_text), _NUMBER.split(second_text)
-    numbers = zip(pieces[1::2], other_pieces[1::2], strict=False)
-    return pieces[::2] == other_pieces[::2] and all(
+    text_parts, other_text_parts = (
+        _NUMBER_PATTERN.split(first_text),
+        _NUMBER_PATTERN.split(second_text),
+    )
+    numbers = zip(text_parts[1::2], other_text_parts[1::2], strict=False)
+    return text_parts[::2] == other_text_parts[::2] and all(
         a == b or is_same_number(a, b) for a, b in numbers
     )
 

@@ -30,7 +30,7 @@ from form_guesses import at_random, constants, guess_predictions, right
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import (
     FormTruth,
@@ -135,7 +135,7 @@ def rule_kinds(analysis: Analysis, loop: Loop | None) -> list[str]:
 
 def forms_of(number: int) -> tuple[FormTruth, dict[str, Answers]]:
     """Return the right answers for one student, and the form of each copying strategy."""
-    content, answer = simulate_assigned(SECRET, Person(f"s{number}"), "mixed")
+    content, answer = simulate_assigned_flight(SECRET, Person(f"s{number}"), "mixed")
     assert answer.form is not None
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, answer.file)

@@ -17,10 +17,10 @@ from statistics import fmean
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
-from px4fuse.classroom.grading.form_points import form_points, panels, right_corrections
+from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
 from px4fuse.results.answer_form import (
     CORRECTIONS,
     EKF2_BEHAVIOURS,
@@ -42,7 +42,7 @@ GUESSES = 20
 def truth(number: int) -> FormTruth:
     """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
-    _, answer = simulate_assigned(SECRET, student, "mixed")
+    _, answer = simulate_assigned_flight(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form
 
@@ -99,11 +99,11 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
     sizes = [wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]
     begins = [wrong.from_s for wrong in of_kind if wrong.from_s is not None] or [0.0]
     for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
-        cure = right_corrections(TrueMistake(kind, size, size, size), truths[0])[0][0]
+        cure = accepted_corrections(TrueMistake(kind, size, size, size), truths[0])[0][0]
         for from_s in (None, float(np.median(begins))):
             claim = StudentMistake(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
-                parameter=cure, panel=panels(kind)[0],
+                parameter=cure, panel=panels_showing(kind)[0],
             )  # fmt: skip
             yield replace(blank, mistakes=(claim,))
 
@@ -112,7 +112,7 @@ def right(one: FormTruth) -> Answers:
     """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
-        parameter, (low, high), _ = right_corrections(wrong, one)[0]
+        parameter, (low, high), _ = accepted_corrections(wrong, one)[0]
         value = 1.1 * low if np.isinf(high) else 0.5 * (low + high)
         value = None if np.isinf(low) else value
         whole = wrong.from_s is None and wrong.until_s is None
@@ -120,7 +120,7 @@ def right(one: FormTruth) -> Answers:
             StudentMistake(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
-                panel=panels(wrong.kind)[0],
+                panel=panels_showing(wrong.kind)[0],
             )
         )  # fmt: skip
     return Answers(

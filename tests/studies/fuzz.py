@@ -39,7 +39,7 @@ import ulog_tools  # noqa: E402
 from class_tools import run_in_turn  # noqa: E402
 from conftest import blank_page  # noqa: E402
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key  # noqa: E402
 from px4fuse.classroom.assignment.roster import read_people, read_roster  # noqa: E402
 from px4fuse.classroom.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
@@ -203,7 +203,10 @@ _OVERRIDES = "id,item,points,comment\ns1,total,80,good\ns2,,,see me\n"
 
 
 def _key() -> list[bytes]:
-    people = (Answer("s1", "Ada", "s1.ulg", "0" * 64), Answer("s2", "山田", "s2.ulg", "1" * 64))
+    people = (
+        RightAnswers("s1", "Ada", "s1.ulg", "0" * 64),
+        RightAnswers("s2", "山田", "s2.ulg", "1" * 64),
+    )
     return [key_text(AnswerKey("aisle", people)).encode()]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
     derive_key,
@@ -27,7 +27,7 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse_mistakes
 
 # True values of the simulation that the answer key lists
-TRUTH_NAMES = (
+TRUE_VALUE_NAMES = (
     "duration_s",
     "sigma_z_m",
     "sigma_a_m_s2",
@@ -38,9 +38,9 @@ TRUTH_NAMES = (
 )
 
 
-def simulate_assigned(
+def simulate_assigned_flight(
     secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
-) -> tuple[bytes, Answer]:
+) -> tuple[bytes, RightAnswers]:
     """Simulate the flight of one student, and return the log (ULog) with the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(
@@ -53,14 +53,14 @@ def simulate_assigned(
     form = replace(
         form_truth(simulation, sha256), predictions=draw_predictions(simulation, draw_number)
     )
-    return log, Answer(
+    return log, RightAnswers(
         student_id=student.student_id,
         name=student.name,
         file=student.file,
         sha256=sha256,
         scenario=to_json_types(asdict(assigned_flight.scenario)),
         mistakes=assigned_flight.mistake_options,
-        truth={name: float(true_values[name]) for name in TRUTH_NAMES},
+        truth={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
         difficulty=assigned_flight.difficulty,
         form=form,
     )
@@ -126,31 +126,33 @@ def assign(
     is_same_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )
-    _check_extends(key_file, key.kind == kind and is_same_class)
-    new_secret = key.secret
+    _require_extension(key_file, key.kind == kind and is_same_class)
+    stored_secret = key.secret
     if secret is None:
-        new_secret = new_secret or secrets.token_urlsafe(24)
-        secret = derive_key(new_secret)
-    elif derive_key(new_secret) != secret:
-        new_secret = ""
+        stored_secret = stored_secret or secrets.token_urlsafe(24)
+        secret = derive_key(stored_secret)
+    elif derive_key(stored_secret) != secret:
+        stored_secret = ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
-        log, answer = simulate_assigned(secret, student, kind, count, truth)
+        log, answer = simulate_assigned_flight(secret, student, kind, count, truth)
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
-        _check_extends(key_file, stored_answer.sha256 == answer.sha256)
+        _require_extension(key_file, stored_answer.sha256 == answer.sha256)
         predictions = stored_answer.form.predictions if stored_answer.form else ()
         questions = [question for question, _ in predictions]
         form = form_text(student.file, answer.sha256, questions).encode()
-        contents = {folder / student.file: log, folder / form_name(student.file): form}
-        missing_contents = {
-            path: content for path, content in contents.items() if not _is_written(path, content)
+        content_by_path = {folder / student.file: log, folder / form_name(student.file): form}
+        missing_content_by_path = {
+            path: content
+            for path, content in content_by_path.items()
+            if not _is_written(path, content)
         }
-        key = AnswerKey(kind, tuple(answers.values()), new_secret)
+        key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the answer key is written before the log, because an interrupted run needs its secret
         write_all({key_file: key_text(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
-        write_all(missing_contents)
-        written_count += folder / student.file in missing_contents
+        write_all(missing_content_by_path)
+        written_count += folder / student.file in missing_content_by_path
         progress(finished_count, len(students))
     return key, written_count
 
@@ -167,7 +169,7 @@ def _is_written(path: Path, content: bytes) -> bool:
     )
 
 
-def _check_extends(key_file: Path, is_extension: bool) -> None:
+def _require_extension(key_file: Path, is_extension: bool) -> None:
     if not is_extension:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Use the "

@@ -25,7 +25,7 @@ _Texts = Annotated[
 ]
 
 
-class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
+class RightAnswers(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     """Assigned flight of one student, with its injected faults and the right answers.
 
     Attributes
@@ -64,7 +64,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     """
 
     kind: _Text
-    answers: Annotated[tuple[Answer, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
+    answers: Annotated[tuple[RightAnswers, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
         msgspec.field(name="students")
     )
     secret: _Text = ""
@@ -74,13 +74,13 @@ class AnswerKey(msgspec.Struct, frozen=True):
     def __repr__(self) -> str:  # without the secret, which an error message must not show
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
-    def of_student(self, student_id: str) -> Answer | None:
+    def of_student(self, student_id: str) -> RightAnswers | None:
         """Return flight and right answers of a student; the id may lack leading zeros."""
         register = Register(Person(answer.student_id) for answer in self.answers)
         student_index = register.student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
-    def of_log(self, sha256: str) -> Answer | None:
+    def of_log(self, sha256: str) -> RightAnswers | None:
         """Return flight and right answers for the log with this SHA-256; None if not assigned."""
         return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 

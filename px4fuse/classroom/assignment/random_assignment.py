@@ -28,10 +28,10 @@ MIN_SECRET_LENGTH = 16
 # First part of each HMAC message. Another label would change all flights, so that students could
 # not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
-# Fractions of flights with 0, 1 and 2 injected faults, unless --mistakes sets the number. The only
+# Fractions of flights with 0, 1 and 2 injected faults, by kind of flight. The only
 # possible injected fault of a loop is "open-end". Many loops have no injected fault, so that
 # students cannot guess "open-end"
-COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
+MISTAKE_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
 }
@@ -154,8 +154,10 @@ def draw(
     SettingsError
         One flight cannot have this many injected faults.
     """
-    possible_kinds = COUNT_FRACTIONS if kind == "mixed" else (kind,)
-    max_count = min(len(COUNT_FRACTIONS[each]) for each in possible_kinds) - 1
+    possible_kinds = MISTAKE_COUNT_FRACTIONS if kind == "mixed" else (kind,)
+    max_count = (
+        min(len(MISTAKE_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
+    )
     if count is not None and not 0 <= count <= max_count:
         raise SettingsError(
             f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
@@ -165,7 +167,7 @@ def draw(
         kind = "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if count is None:
-        count = bisect(list(accumulate(COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
+        count = bisect(list(accumulate(MISTAKE_COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
     mistakes: list[AssignableMistake] = []
     rules = RULES_BY_KIND[kind]
     for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):

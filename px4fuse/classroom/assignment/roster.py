@@ -20,12 +20,12 @@ MAX_STUDENTS = 1000
 # character has up to 4 bytes
 MAX_STEM_LENGTH = 48
 # File names that Windows reserves
-RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
+WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-ROSTER_COLUMNS = read_toml(__file__, "columns.toml", dict[str, tuple[str, ...]])
+TITLES_BY_FIELD = read_toml(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # Fields of a student that are copied from another list if the class list does not contain them
-ADDED_FIELDS = ("name", "email", "login", "submitted", "extended_due")
+FIELDS_OF_OTHER_LISTS = ("name", "email", "login", "submission_time", "extended_due")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
@@ -35,8 +35,8 @@ class Person:
     """Student of the class.
 
     ``login`` is the login on Blackboard or ILIAS, ``numbers`` the student's number by learning
-    platform, ``submitted`` the submission time in Moodle's worksheet, and ``extended_due`` the due
-    time of this student in the form of the option --due.
+    platform, ``submission_time`` the time in Moodle's worksheet, and ``extended_due`` the due time
+    of this student in the form of the option --due.
     """
 
     student_id: str
@@ -44,7 +44,7 @@ class Person:
     email: str = ""
     login: str = ""
     numbers: dict[str, str] = field(default_factory=dict)
-    submitted: str = ""
+    submission_time: str = ""
     extended_due: str = ""
 
     @property
@@ -64,7 +64,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.column(titles) is None for titles in ROSTER_COLUMNS.values()):
+    if all(sheet.column(titles) is None for titles in TITLES_BY_FIELD.values()):
         raise SettingsError(
             f"{sheet.path}: no column identifies the student.",
             "Give one column the title id, email or name.",
@@ -117,7 +117,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """Return the student in a row of a class list; None if the row contains no student."""
     cells = {
         field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
-        for field_name, titles in ROSTER_COLUMNS.items()
+        for field_name, titles in TITLES_BY_FIELD.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NOT_STUDENT_NAMES:
@@ -147,15 +147,16 @@ class Register:
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
-        for other in chain.from_iterable(other_lists):
-            index = self.student_index(other)
-            if index is not None:
-                student = self.people[index]
+        for other_person in chain.from_iterable(other_lists):
+            student_index = self.student_index(other_person)
+            if student_index is not None:
+                student = self.people[student_index]
                 fields = {
-                    name: getattr(student, name) or getattr(other, name) for name in ADDED_FIELDS
+                    name: getattr(student, name) or getattr(other_person, name)
+                    for name in FIELDS_OF_OTHER_LISTS
                 }
-                numbers = other.numbers | student.numbers
-                self.people[index] = replace(student, numbers=numbers, **fields)
+                numbers = other_person.numbers | student.numbers
+                self.people[student_index] = replace(student, numbers=numbers, **fields)
 
     def student_index(self, other: Person) -> int | None:
         """Return the index of a person in the class; None if the person is not identified.
@@ -175,9 +176,11 @@ class Register:
             (_is_same_text, lambda person: person.login or person.student_id, other.login),
             (is_same_name, attrgetter("name"), other.name),
         )
-        for is_same, field_of, value in match_rules:
+        for is_same, get_field, value in match_rules:
             matches = [
-                i for i, person in enumerate(self.people) if is_same(field_of(person), value)
+                index
+                for index, person in enumerate(self.people)
+                if is_same(get_field(person), value)
             ]
             if len(matches) == 1:
                 return matches[0]
@@ -234,7 +237,7 @@ def file_stem(student_id: str) -> str | None:
     if not any(c.isalnum() for c in safe_characters):
         return None
     stem = safe_characters[:MAX_STEM_LENGTH].lstrip(".-+@").rstrip(".")
-    return f"_{stem}" if stem.split(".")[0].casefold() in RESERVED_NAMES else stem
+    return f"_{stem}" if stem.split(".")[0].casefold() in WINDOWS_RESERVED_NAMES else stem
 
 
 def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:

@@ -26,7 +26,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_UPDATES,
+    GATE_QUESTION_UPDATES,
     PREDICTION_RANGES,
     FormQuestion,
     Prediction,
@@ -45,8 +45,9 @@ CLOSURE_TOLERANCE_M = 0.3
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of a position reset of EKF2 that the student must name
 MIN_RESET_M = 0.2
-# Time (s) after the start in which resets are ignored, because EKF2 resets to its first position
-EKF2_START_S = 5.0
+# Time (s) from the start of the flight in which position resets are ignored: EKF2 resets to its
+# first position
+IGNORED_RESETS_S = 5.0
 # Ratio of the upper to the lower limit of a range from which the student chooses
 PREDICTION_RANGE_FACTOR = 1.35
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
@@ -154,7 +155,7 @@ def draw_predictions(
         ),
     }
     predictions: list[tuple[Prediction, RangeName]] = []
-    for change, changed_simulation in changed_simulations.items():
+    for change_text, changed_simulation in changed_simulations.items():
         for name, summary in _compare(changed_simulation).main.filters.items():
             truth = summary.truth
             values = {
@@ -166,7 +167,7 @@ def draw_predictions(
             for quantity, value in values.items():
                 if value is None or not value > 0.0:
                     continue
-                text = f"{quantity} of {name.upper()} {change}"
+                text = f"{quantity} of {name.upper()} {change_text}"
                 right_index = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
                 # keep the value away from the limits of the right range
                 value_index = right_index - 0.2 - 0.6 * draw_number(f"place {text}")
@@ -222,23 +223,27 @@ def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the behaviours of EKF2 that the student must name, and others that are not wrong."""
-    size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
+    size_by_kind = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
-        [behaviour for behaviour, kinds in BEHAVIOUR_RULES[rule].items() if kinds & size_of.keys()]
+        [
+            behaviour
+            for behaviour, kinds in BEHAVIOUR_RULES[rule].items()
+            if kinds & size_by_kind.keys()
+        ]
         for rule in ("required", "allowed")
     )
-    if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
+    if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
         required.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
-        has_bad_samples = "nlos" in size_of or "jump" in size_of
+        has_bad_samples = "nlos" in size_by_kind or "jump" in size_by_kind
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
             required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
-    since_s = comparison.segment.start_s + EKF2_START_S
+    min_reset_time_s = comparison.segment.start_s + IGNORED_RESETS_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        if is_large and reset.time_s > since_s:
+        if is_large and reset.time_s > min_reset_time_s:
             required.append("dead-reckoned, then reset")
     if "never fused" in required:  # EKF2 cannot follow positions that it does not fuse
         required, allowed = ["never fused"], [*required, *allowed]
@@ -249,7 +254,7 @@ def _ekf2_behaviour(
 
 
 def quantity_truth(
-    result: AxisComparison, question: FormQuestion
+    axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
     """Compute the right answer by a run of KF with the settings of the question.
 
@@ -257,7 +262,7 @@ def quantity_truth(
     position σ (m) after predictions with F and Q in steps of DT, without an update.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
-    kf_replay = replay(result.axis, settings)
+    kf_replay = replay(axis_comparison.axis, settings)
     updates = kf_replay.updates.iloc[question.update - 1 :]
     if updates.empty:
         return None
@@ -265,7 +270,7 @@ def quantity_truth(
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: GATE_UPDATES + 1] > question.duration_or_gate**2
+            is_outside = nis.iloc[: GATE_QUESTION_UPDATES + 1] > question.duration_or_gate**2
             outside_numbers = np.flatnonzero(is_outside) + question.update
             return tuple(outside_numbers.astype(float).tolist())
         case "prediction":

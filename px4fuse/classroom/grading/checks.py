@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import OrUnavailable, Share
@@ -26,10 +26,10 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.loop.model import CorrectedPath, CorrectionName, Loop
 from px4fuse.results.answer_form import Answers, check_answers
 from px4fuse.results.contract import (
-    TUNED_FIELDS,
+    ESTIMATE_FIELD_BY_SETTING,
     ComparisonResults,
     ReportedResults,
-    to_json_dict,
+    to_plain,
 )
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.verification.model import Verification
@@ -82,10 +82,10 @@ class RubricItem(
         """Return the fraction of the maximum points (0 to 1), and sentences with the reason."""
         raise NotImplementedError
 
-    def applies(self, kind: str, key: AnswerKey | None) -> bool:
-        """Return True if the item is used for reports of the command ``kind`` (compare or loop)."""
+    def applies(self, command_name: str, key: AnswerKey | None) -> bool:
+        """Return True if the item is used for reports of ``command_name`` (compare or loop)."""
         has_key = key is not None or not self.needs_key
-        return has_key and {self.report, self.command} <= {"any", kind}
+        return has_key and {self.report, self.command} <= {"any", command_name}
 
 
 def fraction_for_deviation(deviation_factor: float, factor: float) -> float:
@@ -121,15 +121,15 @@ class CheckInput:
     @cached_property
     def values(self) -> dict[str, Any]:
         """Values of the results by path, for example ``settings.sigma_z_m``."""
-        return dict(flatten(to_json_dict(self.results)))
+        return dict(flatten(to_plain(self.results)))
 
     @cached_property
-    def answer(self) -> Answer | None:
+    def answer(self) -> RightAnswers | None:
         """Right answers about the log of the report; None if the log was not assigned."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
-    def assigned_answer(self) -> Answer | None:
+    def assigned_answer(self) -> RightAnswers | None:
         """Flight that was assigned to the student, according to the id on the learning platform.
 
         If the platform states no id, the id in the report is used.
@@ -184,20 +184,20 @@ class CheckInput:
 
     def missing_reason(self, path: str) -> str:
         """Return the reason why a value is missing, in brackets; "" if the results state none."""
-        parent = path
-        while parent:
-            for _, reason in values_at(self.values, f"{parent}.reason"):
+        parent_path = path
+        while parent_path:
+            for _, reason in find_values(self.values, f"{parent_path}.reason"):
                 return format_reason(reason)
-            parent = parent.rpartition(".")[0]
+            parent_path = parent_path.rpartition(".")[0]
         return format_reason(BOTH_AXES_ADVICE) if HORIZONTAL in path else ""
 
 
-def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+def find_values(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
     """Return the paths in the results that match a pattern, with their values.
 
     In the pattern, ``*`` matches any key, and quotes enclose a key that contains dots.
 
-    >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
+    >>> find_values({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
     [('a.b.c.0', 1)]
     """
     pattern = re.compile(re.escape(path.replace('"', "")).replace(r"\*", "[^.]*"))
@@ -261,14 +261,14 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         return max(1.0 - excess / zero_excess, 0.0) if zero_excess > 0.0 else 0.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        values = values_at(check_input.values, self.path)
+        values = find_values(check_input.values, self.path)
         numbers = [
             (self._fraction(value), value, path) for path, value in values if is_number(value)
         ]
         if not numbers:
             label = self.name or f"the number {self.path}"
             reason_text = check_input.missing_reason(self.path)
-            return 0.0, f"Your report has no number for {label}{reason_text}."
+            return 0.0, f"Your report does not contain {label}{reason_text}."
         fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
@@ -337,7 +337,9 @@ class TuningItem(RubricItem, frozen=True, tag="tuning"):
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
         horizontal_tuning = comparison.tuning.get(HORIZONTAL)
-        interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[self.setting]}_interval", None)
+        interval = getattr(
+            horizontal_tuning, f"{ESTIMATE_FIELD_BY_SETTING[self.setting]}_interval", None
+        )
         if interval is None or interval[1] is None:
             reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
@@ -384,7 +386,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
             return 0.0, f"Your report has no verdict on KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
-        deviation = "small" if nis_result.nis_mean > 1.0 else "large"
+        direction = "small" if nis_result.nis_mean > 1.0 else "large"
         factor = nis_result.sigma_error_factor
         fraction = fraction_for_deviation(factor, self.factor)
         advice = (
@@ -399,7 +401,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
                 "make KF consistent."
             )
         return fraction, (
-            f"The reported σ of KF is {format_factor(factor)} times too {deviation}. {advice}"
+            f"The reported σ of KF is {format_factor(factor)} times too {direction}. {advice}"
         )
 
 
@@ -449,7 +451,7 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
 
 # Maximum distance (m) between take-off and landing place of a closed loop
-MAX_CLOSED_LOOP_M = 0.5
+MAX_LANDING_DISTANCE_M = 0.5
 # Fraction of the points for a smaller ATE if the report has no reference for computing an ATE
 NO_REFERENCE_FRACTION = 0.5
 
@@ -472,7 +474,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         is_accepted = any(closure.accepted for closure in closures)
         answer = check_input.answer
         landing_distance_m = answer.truth.get("closure_error_m", 0.0) if answer else 0.0
-        if landing_distance_m > MAX_CLOSED_LOOP_M and not is_accepted:
+        if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
             return 1.0, (
                 f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
                 "so it is right that no loop closure was accepted."

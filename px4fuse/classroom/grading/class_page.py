@@ -25,8 +25,8 @@ from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import load_template, local_link
 from px4fuse.results.answer_form import form_rows
 
-BIN_COUNT = 10
-MISSING_REPORT = "no submission"
+HISTOGRAM_BIN_COUNT = 10
+NO_SUBMISSION_STATUS = "no submission"
 # CSS style and symbol of each verification status, in the order in which the class table sorts them
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
@@ -34,13 +34,13 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     "other log": ("odd", "⇄"),
     "cannot verify": ("open", "?"),
     "page differs": ("odd", "≠"),
-    MISSING_REPORT: ("open", "–"),
+    NO_SUBMISSION_STATUS: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
 FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
 
 
-def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
+def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str:
     """Format the class page as HTML; ``made_with`` is name and version of px4fuse."""
     item_titles, number_titles = list_titles(entries)
     counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
@@ -50,7 +50,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        html_above=_above_html(entries, counts),
+        html_above=_statistics_html(entries, counts),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -70,7 +70,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     )
 
 
-def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
+def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     """Format the HTML above the class table: reports by status, and distributions of points."""
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
@@ -94,14 +94,14 @@ def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str
     >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
     """
-    counts, edges = np.histogram(np.clip(values, 0.0, maximum), BIN_COUNT, (0.0, maximum))
+    counts, edges = np.histogram(np.clip(values, 0.0, maximum), HISTOGRAM_BIN_COUNT, (0.0, maximum))
     lower_edges = (format_number(round(edge, 2)) for edge in edges.tolist())
     return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
 def _entry_tags(entry: Entry) -> list[str]:
     report = entry.counted_report
-    tags = [report.status if report else MISSING_REPORT]
+    tags = [report.status if report else NO_SUBMISSION_STATUS]
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
@@ -113,10 +113,10 @@ def _entry_tags(entry: Entry) -> list[str]:
 
 def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
     report = entry.counted_report
-    status = report.status if report else MISSING_REPORT
-    style, symbol = STATUS_STYLES[status]
-    count = len(entry.flags)
-    flag_count_text = f"{count} flag{'s' if count > 1 else ''}" if count else ""
+    status = report.status if report else NO_SUBMISSION_STATUS
+    css_style, symbol = STATUS_STYLES[status]
+    flag_count = len(entry.flags)
+    flag_count_text = f"{flag_count} flag{'s' if flag_count > 1 else ''}" if flag_count else ""
     file = report.submission if report else ""
     late_text = f"{math.ceil(entry.late_s / 60.0)} min late" if entry.late_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
@@ -124,10 +124,10 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
     cells = (
         Cell(entry.display_name, entry.student or None, file),
         frame.text_cell(entry.student_id),
-        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, style),
+        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
         _points_cell(entry),
         frame.text_cell(entry.submission_time, late_text),
-        Cell("\n".join(entry.flags), float(count), "", "flags"),
+        Cell("\n".join(entry.flags), float(flag_count), "", "flags"),
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
@@ -146,7 +146,7 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
 
 
 def _entry_details(entry: Entry) -> Iterator[Section]:
-    """Yield the sections that the class page shows if a row is opened."""
+    """Yield the details of a student, which the class page shows on a click on the row."""
     report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
         yield frame.list_section("Missing", ["No submission."])

@@ -71,8 +71,8 @@ class LateRule:
         >>> parse_late_rule("10%/day up to 30%").deduction(1e9, 50.0)
         15.0
         """
-        units = math.ceil(max(late_s, 0.0) / self.unit_s)
-        return round(max_points * min(units * self.fraction_per_unit, self.max_fraction), 2)
+        late_units = math.ceil(max(late_s, 0.0) / self.unit_s)
+        return round(max_points * min(late_units * self.fraction_per_unit, self.max_fraction), 2)
 
 
 @dataclass(frozen=True)
@@ -174,12 +174,14 @@ def build_entries(
         else Entry(person.name, person.student_id, None, max_points=max_points)
         for student_index, person in enumerate(register.people)
     ]
-    flag = "Neither the report nor the learning platform names a student."
+    unknown_student_flag = "Neither the report nor the learning platform names a student."
     if has_list:
-        flag = "The student is not in the class list."
-    rows += [replace(row, flags=(flag, *row.flags)) for *_, row in attempts[None]]
+        unknown_student_flag = "The student is not in the class list."
+    rows += [replace(row, flags=(unknown_student_flag, *row.flags)) for *_, row in attempts[None]]
     overrides_by_row, notes = match_overrides(overrides, rows)
-    flags = flag_equal_contents([row.counted_report for row in rows if row.counted_report])
+    flags_by_submission = flag_equal_contents(
+        [row.counted_report for row in rows if row.counted_report]
+    )
     submitted_rows = [row for row in rows if row.counted_report]
     unknown_count = sum(row.late_s is None for row in submitted_rows)
     if course.late_rule and unknown_count:
@@ -188,7 +190,7 @@ def build_entries(
             "students, so no points were deducted. Add the times with --worksheet.",
         )
     final_rows = (
-        _apply_overrides(*row_and_overrides, flags, course)
+        _apply_overrides(*row_and_overrides, flags_by_submission, course)
         for row_and_overrides in zip(rows, overrides_by_row, strict=True)
     )
     return tuple(final_rows), notes
@@ -231,14 +233,15 @@ def _make_attempt(
         due_time = parse_due_time(
             person.extended_due, f"extension of {one_line(person.student_id, 40)}:", due_time.tzinfo
         )
-    stated_time = origin.time or parse_moodle_time(person.submitted)
-    time, zip_time = (
-        time and add_time_zone(time, due_time) for time in (stated_time, submission.time)
+    stated_time = origin.time or parse_moodle_time(person.submission_time)
+    submission_time, zip_time = (
+        submission_time and add_time_zone(submission_time, due_time)
+        for submission_time in (stated_time, submission.time)
     )
     late_s, flags = None, []
-    if due_time is not None and time is not None:
+    if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetimes ignore daylight saving within a time zone
-        late_s = time.timestamp() - due_time.timestamp()
+        late_s = submission_time.timestamp() - due_time.timestamp()
         late_s = late_s if late_s > course.grace_s else 0.0
     elif origin.is_late:
         flags.append(
@@ -261,18 +264,21 @@ def _make_attempt(
             f"The id in the report is that of {stated_person.student_id} "
             f"({stated_person.name or 'no name'}), but {platform} names another student."
         )
-    rule = course.late_rule
+    late_rule = course.late_rule
     entry = Entry(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
-        submission_time="" if time is None else time.strftime(TIME_FORMAT),
+        submission_time="" if submission_time is None else submission_time.strftime(TIME_FORMAT),
         late_s=late_s,
-        deduction=rule.deduction(late_s, report.max_points) if rule and late_s else 0.0,
+        deduction=late_rule.deduction(late_s, report.max_points) if late_rule and late_s else 0.0,
         max_points=report.max_points,
         flags=tuple(flags),
     )
-    sort_key = (time.timestamp() if time else 0.0, zip_time.timestamp() if zip_time else 0.0)
+    sort_key = (
+        submission_time.timestamp() if submission_time else 0.0,
+        zip_time.timestamp() if zip_time else 0.0,
+    )
     return sort_key, report, entry
 
 
@@ -285,26 +291,33 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
     # several reports of one submission have the same time; points are the second sort key
     sorted_attempts = sorted(
-        attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission)
+        attempts,
+        key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
     )
     # reports that the instructor does not have to check are preferred, and then files with a report
-    with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
-    without_action = [attempt for attempt in with_report if not attempt[1].instructor_action]
-    eligible = without_action or with_report or sorted_attempts
+    attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
+    attempts_without_action = [
+        attempt for attempt in attempts_with_report if not attempt[1].instructor_action
+    ]
+    eligible_attempts = attempts_without_action or attempts_with_report or sorted_attempts
     chosen_key, chosen_report, entry = {
-        "latest": eligible[-1],
+        "latest": eligible_attempts[-1],
         # if the first submission contains several reports, the report with most points is used
-        "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
-        "best": max(reversed(eligible), key=_points_after_deduction),
+        "first": [
+            attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
+        ][-1],
+        "best": max(reversed(eligible_attempts), key=_points_after_deduction),
     }[course.attempt]
     flags = list(entry.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
-    forms = [report.form for sort_key, report, _ in eligible if sort_key == chosen_key]
+    forms = [report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_key]
     # students must not hand in several forms with different guesses, of which the best would count
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
-    elif course.attempt == "best" and len({report.form for _, report, _ in with_report}) > 1:
+    elif (
+        course.attempt == "best" and len({report.form for _, report, _ in attempts_with_report}) > 1
+    ):
         flags.append(f"The student handed in {len(attempts)} reports with different answer forms.")
     elif len(forms) > 1 and any(chosen_key):
         flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
@@ -325,25 +338,25 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
 
 def _apply_overrides(
     entry: Entry,
-    own_overrides: Mapping[str, Override],
+    override_by_title: Mapping[str, Override],
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
 ) -> Entry:
     """Apply the instructor's points and comments, compute the total, and add flags."""
     report, total, flags = entry.counted_report, None, entry.flags
     if report is not None:
-        items = (_override_item(item, own_overrides.get(item.title)) for item in report.items)
+        items = (_override_item(item, override_by_title.get(item.title)) for item in report.items)
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
             total = round(max(report.points - entry.deduction, 0.0), 2)
     report_override, total_override = (
-        own_overrides.get(title, Override()) for title in ("", TOTAL_TITLE)
+        override_by_title.get(title, Override()) for title in ("", TOTAL_TITLE)
     )
     return replace(
         entry,
         counted_report=report,
-        overrides=own_overrides,
+        overrides=override_by_title,
         comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
         total=total if total_override.points is None else total_override.points,
         flags=flags,
@@ -422,8 +435,8 @@ def match_overrides(
         Sentences about points and comments that match no row or item.
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
-    all_points = (report.max_points for entry in entries for report in entry.reports)
-    max_total = max(all_points, default=math.inf)
+    max_points_of_reports = (report.max_points for entry in entries for report in entry.reports)
+    max_total = max(max_points_of_reports, default=math.inf)
     people = Register(
         Person(entry.student_id, login=report.submission if report else "")
         for entry in entries
@@ -441,11 +454,11 @@ def match_overrides(
         if report := entries[student_index].counted_report:
             max_by_title |= {item.title: item.max_points for item in report.items}
             max_by_title[TOTAL_TITLE] = report.max_points
-        titles = {normalise_text(title): title for title in max_by_title}
-        for item, override in override_by_item.items():
-            title, problem = titles.get(normalise_text(item)), ""
+        title_by_normalised = {normalise_text(title): title for title in max_by_title}
+        for item_title, override in override_by_item.items():
+            title, problem = title_by_normalised.get(normalise_text(item_title)), ""
             if title is None:
-                problem = f"student {student_text} has no item {one_line(item, 60)!r}"
+                problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
             elif title in matched_overrides[student_index]:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
@@ -527,10 +540,10 @@ def parse_moodle_time(text: str) -> datetime | None:
     '2026-11-20T23:58:00'
     >>> parse_moodle_time("-")
     """
-    if german := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
-        day, month, year, clock = german.groups()
-        if (name := month.casefold()[:3]) in GERMAN_MONTHS:
-            text = f"{year}-{GERMAN_MONTHS.index(name) + 1:02}-{day:>02} {clock:>05}"
+    if german_match := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
+        day, month, year, clock = german_match.groups()
+        if (month_start := month.casefold()[:3]) in GERMAN_MONTHS:
+            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {clock:>05}"
     with suppress(ValueError):
         return datetime.fromisoformat(text.strip())
     for time_format in _MOODLE_FORMATS:

@@ -51,16 +51,18 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if isinstance(results, LoopResults):
         yield from _flag_drift(results.request)
         return
-    settings, whole_s = results.settings, results.log.duration_s
-    fraction = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
-    has_segment = (results.request.start_s, results.request.end_s) != (None, None)
-    if has_segment and fraction < MIN_SEGMENT_FRACTION:
+    settings, log_duration_s = results.settings, results.log.duration_s
+    analysed_fraction = (
+        (settings.end_s - settings.start_s) / log_duration_s if log_duration_s else 1.0
+    )
+    has_time_options = (results.request.start_s, results.request.end_s) != (None, None)
+    if has_time_options and analysed_fraction < MIN_SEGMENT_FRACTION:
         yield (
-            f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
-            f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask the student for the reason."
+            f"The student analysed only {analysed_fraction:.0%} of the log ({settings.start_s:.1f} "
+            f"to {settings.end_s:.1f} s of {log_duration_s:.1f} s). Ask the student for the reason."
         )
-    without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
-    if settings.input == "zero" and not without_imu:
+    has_no_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
+    if settings.input == "zero" and not has_no_imu:
         yield "KF did not use the IMU (--input zero)."
     source = results.source
     tracks_as_received = [track.name for track in source.available if track.path == "as received"]
@@ -69,7 +71,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
-    if results.log.hardware == flights.HARDWARE and not has_key:
+    if results.log.hardware == flights.SIMULATION_HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
 
 
@@ -129,7 +131,7 @@ def _student_key(report: GradedReport) -> str:
 
 # Checks for equal contents of two reports: text of the flag, functions that return the compared
 # content and the owner of a report. Reports of the same owner are not compared
-COMMON_CHECKS: tuple[
+EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
     ("This PDF is identical to the PDF of {}.", attrgetter("sha256"), attrgetter("submission")),
@@ -158,34 +160,36 @@ COMMON_CHECKS: tuple[
 def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
     """Return the flags about equal contents of two reports, by name of the submission."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
-    for sentence, pairs in (
+    for flag_text, pairs in (
         *(
-            (sentence, _same_pairs(reports, key_of, owner_of))
-            for sentence, key_of, owner_of in COMMON_CHECKS
+            (flag_text, _same_pairs(reports, content_of, owner_of))
+            for flag_text, content_of, owner_of in EQUAL_CONTENT_CHECKS
         ),
         ("The answer form has the same numbers as the form of {}.", _copied_forms(reports)),
     ):
-        texts_by_submission: dict[str, list[str]] = defaultdict(list)
+        students_by_submission: dict[str, list[str]] = defaultdict(list)
         for report, other_report in chain.from_iterable(map(permutations, pairs)):
             file = one_line(other_report.submission, 80)
-            texts_by_submission[report.submission].append(f"{_student_text(other_report)} ({file})")
-        for name, texts in texts_by_submission.items():
-            flags_by_submission[name].append(
-                sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))
+            students_by_submission[report.submission].append(
+                f"{_student_text(other_report)} ({file})"
+            )
+        for submission_name, student_texts in students_by_submission.items():
+            flags_by_submission[submission_name].append(
+                flag_text.format(join_first(student_texts, MAX_LISTED_REPORTS, "; "))
             )
     return flags_by_submission
 
 
 def _same_pairs(
     reports: Sequence[GradedReport],
-    key_of: Callable[[GradedReport], object],
+    content_of: Callable[[GradedReport], object],
     owner_of: Callable[[GradedReport], str],
 ) -> Pairs:
-    groups: dict[object, list[GradedReport]] = defaultdict(list)
+    reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
-        groups[key_of(report)].append(report)
-    for key, group in groups.items():
-        for report, other_report in combinations(group if key else (), 2):
+        reports_by_content[content_of(report)].append(report)
+    for content, equal_reports in reports_by_content.items():
+        for report, other_report in combinations(equal_reports if content else (), 2):
             if owner_of(report) != owner_of(other_report):
                 yield report, other_report
 

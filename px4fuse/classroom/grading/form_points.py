@@ -29,15 +29,15 @@ from px4fuse.results.answer_form import (
 DIAGNOSIS_SHARE = 0.2
 # Points deducted for each false fault
 FALSE_MISTAKE_POINTS = 10.0
-# Number of false faults from which on the right faults give no points
-TOO_MANY_FALSE_MISTAKES = 3
-# Fraction of the points if the form names another fault of the same group in form_points.toml
-NEIGHBOUR_FRACTION = 0.4
+# Minimum number of false faults in an answer form for which its right faults give no points
+MIN_FALSE_MISTAKES_WITHOUT_POINTS = 3
+# Fraction of the points if the answer form names another fault of the same group
+SAME_GROUP_FRACTION = 0.4
 # Fraction of the points if the answer form names ekf2-noise instead of r-scale: both make R wrong
-SAME_NUMBER_FRACTION = 2.0 / 3.0
+NOISE_FOR_R_SCALE_FRACTION = 2.0 / 3.0
 # Fraction of the points if the answer form names a consequence of the injected fault
 EFFECT_FRACTION = 0.15
-# Injected faults that can be guessed without a measurement
+# Kinds of injected faults that can be guessed without a measurement
 GUESSABLE_KINDS = frozenset(("open-end",))
 # Relative error over which the points for the size of a guessable fault decrease from full to zero:
 # the sizes that are assigned to students differ little
@@ -49,18 +49,18 @@ TIME_TOLERANCE_S = 2.0
 # data
 TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a computed number for full points
-FULL_TOLERANCE = 0.02
+FULL_POINTS_TOLERANCE = 0.02
 # Maximum relative error of a computed number for half of the points
-HALF_TOLERANCE = 0.10
+HALF_POINTS_TOLERANCE = 0.10
 # Maximum relative error of the size of an injected fault for half of the points
-HALF_SIZE_TOLERANCE = 0.4
+HALF_POINTS_SIZE_TOLERANCE = 0.4
 
 
 class _CorrectionRule(NamedTuple):
     """Correction of injected faults, and the fraction of the points for naming it.
 
     ``right_values`` are the smallest and the largest right value of the parameter, or the name of
-    bounds that :func:`right_corrections` computes.
+    bounds that :func:`accepted_corrections` computes.
     """
 
     parameter: str
@@ -78,14 +78,14 @@ PART_NAMES = tuple(POINTS_TABLE["weights"])
 class FormPoints:
     """Points for each part of an answer form ("mistakes", "sizes", ...).
 
-    ``feedback`` are clauses for the student. ``is_kind_named`` is True for each injected fault of
-    the flight that the form names.
+    ``feedback`` are clauses for the student. ``is_named_by_kind`` is True for each injected fault
+    of the flight that the form names.
     """
 
     points_by_part: Mapping[str, float]
     max_points_by_part: Mapping[str, float]
     feedback: tuple[str, ...] = ()
-    is_kind_named: Mapping[str, bool] = field(default_factory=dict)
+    is_named_by_kind: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def fraction(self) -> float:
@@ -94,11 +94,11 @@ class FormPoints:
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Compute the points of an answer form by comparison with the right answers."""
-    is_clean_named = not truth.mistakes and answers.names_no_mistake
-    weights = POINTS_TABLE["weights_clean" if is_clean_named else "weights"]
+    is_no_mistake_right = not truth.mistakes and answers.names_no_mistake
+    weights = POINTS_TABLE["weights_clean" if is_no_mistake_right else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_mistakes = _match_mistakes(answers, truth)
-    if truth.mistakes and len(false_mistakes) < TOO_MANY_FALSE_MISTAKES:
+    if truth.mistakes and len(false_mistakes) < MIN_FALSE_MISTAKES_WITHOUT_POINTS:
         fractions |= _mistake_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
     # half of the points for the verdicts if no computed number is right, because most verdicts can
@@ -107,7 +107,7 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
         1.0 if quantities_fraction else 0.5
     )
     points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
-    if is_clean_named:
+    if is_no_mistake_right:
         points_by_part["mistakes"] = weights["mistakes"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
         # no injected fault of this flight has a size, so the part "mistakes" gets the points of
@@ -118,17 +118,17 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.predictions:
         weights = {name: DIAGNOSIS_SHARE * points for name, points in weights.items()}
         weights["predictions"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
-        points_by_part = {name: DIAGNOSIS_SHARE * each for name, each in points_by_part.items()}
+        points_by_part = {name: DIAGNOSIS_SHARE * points for name, points in points_by_part.items()}
         points_by_part["predictions"] = weights["predictions"] * _prediction_fraction(
             answers, truth
         )
     named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
-    is_kind_named = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
+    is_named_by_kind = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
     feedback = (
-        *_mistake_feedback(matches, false_mistakes, is_clean_named),
+        *_mistake_feedback(matches, false_mistakes, is_no_mistake_right),
         *_prediction_feedback(answers, truth),
     )
-    return FormPoints(points_by_part, weights, feedback, is_kind_named)
+    return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
 
 
 # Injected fault, matching fault in the answer form (if any), and fraction of the points
@@ -136,11 +136,11 @@ Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
-    matches: list[Match], false_mistakes: list[StudentMistake], is_clean_named: bool
+    matches: list[Match], false_mistakes: list[StudentMistake], is_no_mistake_right: bool
 ) -> Iterator[str]:
     """Yield a clause for each right or missed injected fault, and one for all false faults."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * is_clean_named}"
+        yield f"your flight has no injected fault{', as your form states' * is_no_mistake_right}"
     for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
         right_answer = describe_right_answer(mistake)
@@ -164,7 +164,7 @@ def describe_right_answer(mistake: TrueMistake) -> str:
     start_text = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
     end_text = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
-    return ", ".join([*texts, f"shown in {' or '.join(panels(mistake.kind))}"])
+    return ", ".join([*texts, f"shown in {' or '.join(panels_showing(mistake.kind))}"])
 
 
 def _prediction_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
@@ -211,15 +211,15 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
-        return SAME_NUMBER_FRACTION
+        return NOISE_FOR_R_SCALE_FRACTION
     if any({kind, named_kind} <= group for group in NEIGHBOURS):
-        return NEIGHBOUR_FRACTION
+        return SAME_GROUP_FRACTION
     return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
     """Return the fraction of the points of the parts about faults, as means over all faults."""
-    sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
+    mistake_with_size_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:
         if student_mistake is None:
@@ -232,7 +232,7 @@ def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, floa
             time_and_panel_fraction(mistake, student_mistake) * time_weight
         )
         fractions["correction"] += correction_fraction(mistake, student_mistake, truth) * weight
-        fractions["sizes"] += size_points / max(sized_count, 1)
+        fractions["sizes"] += size_points / max(mistake_with_size_count, 1)
     return fractions
 
 
@@ -250,7 +250,7 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
         is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
         return is_right / 3.0
     deviation = abs(size - mistake.size) / abs(mistake.size)
-    close_fraction = 0.5 * (deviation <= HALF_SIZE_TOLERANCE)
+    close_fraction = 0.5 * (deviation <= HALF_POINTS_SIZE_TOLERANCE)
     if mistake.kind in GUESSABLE_KINDS:
         tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
         close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
@@ -269,10 +269,10 @@ def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistak
             for true_s, named_s in times
             if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (student_mistake.panel in panels(mistake.kind))
+    return 0.5 * is_time_right + 0.5 * (student_mistake.panel in panels_showing(mistake.kind))
 
 
-def panels(kind: str) -> list[str]:
+def panels_showing(kind: str) -> list[str]:
     return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
 
 
@@ -285,7 +285,7 @@ def correction_fraction(
         fraction
         if (low, high) == ANY_BOUNDS
         else fraction * (0.5 if value is None else _value_fraction(value, low, high, 0.5))
-        for parameter, (low, high), fraction in right_corrections(mistake, truth)
+        for parameter, (low, high), fraction in accepted_corrections(mistake, truth)
         if parameter == student_mistake.parameter
     ]
     return max(fractions, default=0.0)
@@ -298,16 +298,16 @@ def _value_fraction(value: float, low: float, high: float, fraction_outside: flo
     return 1.0 / 3.0 if low <= -value <= high else fraction_outside
 
 
-# Parameter that corrects an injected fault, bounds of its right values, and fraction of the points
-RightCorrection = tuple[str, tuple[float, float], float]
+# Parameter that corrects an injected fault, bounds of its accepted values, fraction of the points
+AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 
-def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorrection, ...]:
-    """Return the parameters that correct an injected fault, with bounds of their right values."""
+def accepted_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[AcceptedCorrection, ...]:
+    """Return the parameters that correct an injected fault, with bounds of accepted values."""
     size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
     from_s = mistake.from_s or 0.0
     until_s = from_s if mistake.until_s is None else mistake.until_s
-    bounds = {
+    bounds_by_name = {
         "negated": (-high, -low),
         "size": (low, high),
         "late milliseconds": (1e3 * low, 1e3 * high),
@@ -320,7 +320,7 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
     return tuple(
         (
             rule.parameter,
-            bounds[values] if isinstance(values := rule.right_values, str) else values,
+            bounds_by_name[values] if isinstance(values := rule.right_values, str) else values,
             rule.fraction_by_mistake[mistake.kind],
         )
         for rule in CORRECTIONS
@@ -368,9 +368,9 @@ def _prediction_fraction(answers: Answers, truth: FormTruth) -> float:
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
     """Return the fraction of the points for the numbers of KF that the student computed."""
     # an empty list of updates is the right answer on most flights, so it has no points
-    known_count = sum(value not in (None, ()) for value in truth.quantities)
+    scored_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
-    return sum(_quantity_fraction(*pair) for pair in pairs) / max(known_count, 1)
+    return sum(_quantity_fraction(*pair) for pair in pairs) / max(scored_count, 1)
 
 
 def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
@@ -380,7 +380,7 @@ def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> fl
         has_right_number = not set(answer).isdisjoint(true_value)
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(true_value, float | int):
-        for tolerance, fraction in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
+        for tolerance, fraction in ((FULL_POINTS_TOLERANCE, 1.0), (HALF_POINTS_TOLERANCE, 0.5)):
             if abs(answer - true_value) <= tolerance * abs(true_value):
                 return fraction
     return 0.0

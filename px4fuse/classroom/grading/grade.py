@@ -19,7 +19,7 @@ from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import ResultsError
 
-FAILED_REMEDY = "Do not open the file. Ask for the PDF that px4fuse wrote."
+FAILED_REMEDY = "Do not open the file. Ask the student for the PDF that px4fuse wrote."
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,10 @@ def grade(
         )
         jobs.append((submission, submitter_id))
     rubric_and_key, logs = (course.rubric, course.key), files_by_sha256(course.logs)
-    records = output / RECORDS_FOLDER
-    grade_job = partial(grade_submission, *rubric_and_key, logs, records, max_log_bytes.get())
+    records_folder = output / RECORDS_FOLDER
+    grade_job = partial(
+        grade_submission, *rubric_and_key, logs, records_folder, max_log_bytes.get()
+    )
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
@@ -134,7 +136,7 @@ def grade_submission(
     assigned_hashes = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
     sha256, is_loaded = "", False
     try:
-        content = submissions.read(submission)
+        content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
         results, verdict, is_loaded = load_or_verify(records, content, logs, assigned_hashes)
     except ResultsError as error:

@@ -11,7 +11,7 @@ from px4fuse.classroom.grading.model import GradedReport
 
 # Minimum number of reports for a correlation of points
 MIN_REPORTS = 5
-TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
+ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class ItemStatistics:
     discrimination: float | None
 
     @property
-    def row(self) -> tuple[str, ...]:
-        """Cells of the row of ``items.csv``, in the order of TITLES."""
+    def csv_row(self) -> tuple[str, ...]:
+        """Cells of the row of ``items.csv``, in the order of ITEM_STATISTICS_TITLES."""
         numbers = (
             len(self.fractions),
             round(float(np.mean(self.fractions)), 3),
@@ -53,14 +53,14 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     for report in reports:
         if report.instructor_action:
             continue
-        for place, prefix, items in (
+        for group_index, prefix, items in (
             (0, "", report.items),
             (1, "Answer form: ", report.form_parts),
         ):
             total = sum(item.points for item in items)
             for item in items:
-                row = item.points, item.max_points, total - item.points
-                rows_by_item[place, f"{prefix}{item.title}"].append(row)
+                item_row = item.points, item.max_points, total - item.points
+                rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
         for kind, is_named in report.mistakes.items():
             rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []

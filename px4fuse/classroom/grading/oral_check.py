@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.truth import FormTruth
-from px4fuse.classroom.grading.form_points import describe_right_answer, panels
+from px4fuse.classroom.grading.form_points import describe_right_answer, panels_showing
 from px4fuse.classroom.grading.model import Entry
 from px4fuse.core.text import one_line
 from px4fuse.results.answer_form import MISTAKES, NO_MISTAKE_KIND, PANELS, Answers
@@ -25,8 +25,8 @@ def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
         lines += ["", one_line(f"{entry.display_name} {entry.student_id}", 100)]
         questions = [*ask_about_form(report.form, answer.form)][:count]
         for number, (question, expected) in enumerate(questions, start=1):
-            for label, text in ((f"{number}. ", question), ("   Expected: ", expected)):
-                lines += textwrap.wrap(text, 96, initial_indent=label, subsequent_indent="   ")
+            for prefix, text in ((f"{number}. ", question), ("   Expected: ", expected)):
+                lines += textwrap.wrap(text, 96, initial_indent=prefix, subsequent_indent="   ")
     return "\n".join(lines) + "\n"
 
 
@@ -41,8 +41,8 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
         yield (
             f"You named {kind} ({MISTAKES[kind].description}). Which panel would show this fault, "
             "and does the panel of your report show it?",
-            f"{' or '.join(panels(kind))}. The panel does not show the fault. The flight has "
-            f"{flight_text}.",
+            f"{' or '.join(panels_showing(kind))}. The panel does not show the fault. The flight "
+            f"has {flight_text}.",
         )
     for mistake in truth.mistakes:
         description = MISTAKES[mistake.kind].description
@@ -53,11 +53,11 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
                 f"{describe_right_answer(mistake)}.",
             )
             continue
-        blind_panels = [panel for panel in PANELS if panel not in panels(mistake.kind)]
+        blind_panels = [panel for panel in PANELS if panel not in panels_showing(mistake.kind)]
         yield (
             f"You named {mistake.kind} ({description}). Show it in your report, and name a panel "
             "that cannot show it, with the reason.",
-            f"{describe_right_answer(mistake)}. Cannot show it, for example: "
+            f"{describe_right_answer(mistake)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )
     given_ranges = dict(enumerate(form.predictions))

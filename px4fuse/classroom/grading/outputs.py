@@ -36,9 +36,9 @@ from px4fuse.classroom.assignment.roster import (
 )
 from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.checks import shorten_text
-from px4fuse.classroom.grading.class_page import html_text
+from px4fuse.classroom.grading.class_page import class_page_html
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
-from px4fuse.classroom.grading.item_analysis import TITLES, analyse_items
+from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
 from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
 from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
@@ -53,9 +53,9 @@ from px4fuse.html.safe import load_template
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
-NAMES_FILE = "names.csv"
+PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
-NAMES_TITLES = ("pseudonym", "id", "name")
+PSEUDONYM_TITLES = ("pseudonym", "id", "name")
 # Columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
     "file",
@@ -112,7 +112,7 @@ def write_class(
     OutputError
         The folder cannot be written.
     """
-    title = course.title or course.rubric.title or "Class"
+    class_title = course.title or course.rubric.title or "Class"
     stems = file_names([_entry_identity(entry, stem=True) for entry in entries])
     page_entries = [
         _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
@@ -120,18 +120,21 @@ def write_class(
     has_redrawn = any(
         entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
     )
-    feedback_texts = [feedback_text(entry, title) for entry in entries]
+    feedback_texts = [feedback_text(entry, class_title) for entry in entries]
     reports = [report for entry in entries if (report := entry.counted_report)]
-    item_rows = tuple(tuple(map(neutralise_formulas, i.row)) for i in analyse_items(reports))
+    item_rows = tuple(
+        tuple(map(neutralise_formulas, item_statistics.csv_row))
+        for item_statistics in analyse_items(reports)
+    )
     contents = {
-        "class.csv": csv_text(entries).encode(),
-        "items.csv": ("\ufeff" + Sheet(Path(), TITLES, item_rows).text).encode(),
+        "class.csv": class_table_csv(entries).encode(),
+        "items.csv": ("\ufeff" + Sheet(Path(), ITEM_STATISTICS_TITLES, item_rows).text).encode(),
     }
     if course.anonymous:
-        page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
-        contents[NAMES_FILE] = names_table.encode()
+        page_entries, names_table = _anonymise_entries(page_entries, output / PSEUDONYMS_FILE)
+        contents[PSEUDONYMS_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = html_text(page_entries, title, made_with).encode()
+    contents["class.html"] = class_page_html(page_entries, class_title, made_with).encode()
     if course.question_count and course.key is not None:
         text = questions_text(entries, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
@@ -140,8 +143,8 @@ def write_class(
     for stem, text in zip(stems, feedback_texts, strict=True):
         contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
     notes: list[str] = []
-    names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
-    for sheet, name in zip(course.worksheets, names, strict=True):
+    table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
+    for sheet, name in zip(course.worksheets, table_names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
             sheet, entries, course.register, course.column, feedback_texts, course.scale
         )
@@ -192,26 +195,28 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
         with inputs_not_registered():
             sheet = read_sheet(path)
         for row in sheet.rows:
-            name, identity, student = (
-                sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_TITLES
+            pseudonym, identity, student = (
+                sheet.cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
             )
-            names_by_identity[identity] = name, student
-    used_names = {name for name, _ in names_by_identity.values()}
-    numbered_names = (f"Student {number:03}" for number in itertools.count(1))
-    free_names = (name for name in numbered_names if name not in used_names)
+            names_by_identity[identity] = pseudonym, student
+    used_pseudonyms = {pseudonym for pseudonym, _ in names_by_identity.values()}
+    numbered_pseudonyms = (f"Student {number:03}" for number in itertools.count(1))
+    free_pseudonyms = (
+        pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
+    )
     students = {_entry_identity(entry): entry.student for entry in entries}
     new_identities = [identity for identity in students if identity not in names_by_identity]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
-        names_by_identity[identity] = next(free_names), students[identity]
+        names_by_identity[identity] = next(free_pseudonyms), students[identity]
     rows = (
-        (name, neutralise_id(identity), neutralise_formulas(student))
-        for identity, (name, student) in sorted(names_by_identity.items(), key=itemgetter(1))
+        (pseudonym, neutralise_id(identity), neutralise_formulas(student))
+        for identity, (pseudonym, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
     anonymous_entries = [
         anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
     ]
-    names_table = "\ufeff" + Sheet(path, NAMES_TITLES, tuple(rows)).text
+    names_table = "\ufeff" + Sheet(path, PSEUDONYM_TITLES, tuple(rows)).text
     return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
 
 
@@ -248,7 +253,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 # ------------------------------------------------------------------ the class table
 
 
-def csv_text(entries: Sequence[Entry]) -> str:
+def class_table_csv(entries: Sequence[Entry]) -> str:
     """Format the class table as CSV for Excel and LibreOffice."""
     item_titles, number_titles = list_titles(entries)
     titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
@@ -396,7 +401,7 @@ def fill_grades(
             continue
         if scale is not None and rubric_maximum:
             total = round(total * scale / rubric_maximum, 2)
-        max_points = _max_points(sheet, row, grade_index)
+        max_points = _platform_max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
@@ -419,7 +424,7 @@ def fill_grades(
     return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
 
 
-def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
+def _platform_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
     """Return the maximum points on the learning platform, if its table contains them."""
     maximum_texts = (
         cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()

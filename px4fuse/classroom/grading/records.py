@@ -27,7 +27,7 @@ from px4fuse.verification.verification import log_sha256, recompute, verify
 RECORDS_FOLDER = "records"
 # Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
-# Suffix of a report with px4fuse's diagnosis, which the report of an assignment withholds
+# Suffix of a report with px4fuse's diagnosis, which is the feedback on an assignment
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 
@@ -110,8 +110,12 @@ def _dependencies(
 ) -> dict[str, str]:
     """Return the version of each library, and the availability of each input file by SHA-256."""
     return _versions() | {
-        name: "available" if name in logs else "assigned" if name in assigned_hashes else "missing"
-        for name in sorted(set(file_hashes_in(results)))
+        sha256: "available"
+        if sha256 in logs
+        else "assigned"
+        if sha256 in assigned_hashes
+        else "missing"
+        for sha256 in sorted(set(file_hashes_in(results)))
     }
 
 

@@ -36,7 +36,7 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import cannot_verify, log_sha256
 
-DEFAULT_NAME = "rubric.toml"
+DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
@@ -54,10 +54,10 @@ TABLE_NUMBERS = (
 )
 
 if TYPE_CHECKING:
-    AnyItem = RubricItem
+    AnyRubricItem = RubricItem
 else:
     # union of the item classes of all checks; the field "check" of the TOML file selects one
-    AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
+    AnyRubricItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
 # Rule for the points of a report. "pending": the instructor decides whether they count
 PointsRule = Literal["pending", "zero", "count"]
 
@@ -79,7 +79,7 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     unverified: Literal["pending", "zero"] = "pending"
     others_log: PointsRule = "pending"
     pages: PointsRule = "count"
-    items: Annotated[tuple[AnyItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
+    items: Annotated[tuple[AnyRubricItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
         name="item"
     )
 
@@ -93,7 +93,9 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def rubric_text() -> str:
-    return files("px4fuse.classroom.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
+    return (
+        files("px4fuse.classroom.grading").joinpath(DEFAULT_RUBRIC_NAME).read_text(encoding="utf-8")
+    )
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -105,7 +107,7 @@ def read_rubric(path: Path | None) -> Rubric:
         The file cannot be read or is not a rubric; the message names the item and the field.
     """
     if path is None:
-        return parse_rubric(rubric_text(), DEFAULT_NAME)
+        return parse_rubric(rubric_text(), DEFAULT_RUBRIC_NAME)
     return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
 
 
@@ -173,7 +175,7 @@ def score_report(
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=rule_text if points_rule == "pending" else "",
-        mistakes=form_result.is_kind_named,
+        mistakes=form_result.is_named_by_kind,
         form_parts=tuple(
             Item(name, form_result.points_by_part[name], max_points, "")
             for name, max_points in form_result.max_points_by_part.items()
@@ -193,14 +195,16 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
     Return the rule, with the reason for zero points or the action of the instructor.
     """
     verdict = check_input.verdict
-    reason = format_reason("".join(verdict.reasons[:1]))
+    first_reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
-        return "zero", f"the numbers of your report differ from those of its log{reason}"
+        return "zero", f"the numbers of your report differ from those of its log{first_reason}"
     # problems of the report: rule of the rubric, text for the student, action of the instructor
     problems: list[tuple[PointsRule, str, str]] = []
     if verdict.status != "verified":
-        action = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
-        problems.append((rubric.unverified, f"your report could not be verified{reason}", action))
+        action = verdict.remedy or f"Check the report by hand: it was not verified{first_reason}."
+        problems.append(
+            (rubric.unverified, f"your report could not be verified{first_reason}", action)
+        )
     elif verdict.page_status == "differ":
         reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
         problems.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))

@@ -121,7 +121,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     notes: list[str] = []
     submission_by_path: dict[tuple[Path, str], Submission] = {}
     origin_by_number: dict[str, ExportOrigin] = {}
-    other_names, zip_count = list[str](), 0
+    ignored_names, zip_count = list[str](), 0
     for path in paths:
         is_export = path.is_file() and path.name.lower().endswith(".zip")
         for submission in (_zip_submissions if is_export else _folder_submissions)(path, notes):
@@ -130,17 +130,17 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
             if suffix in (".pdf", ".zip"):
                 submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
                 zip_count += suffix == ".zip"
-            elif not _is_metadata(submission.name):
-                other_names.append(_short_name(submission.name))
+            elif not _is_gradescope_metadata(submission.name):
+                ignored_names.append(_short_name(submission.name))
             else:
                 try:
-                    text = read(submission).decode("utf-8", errors="replace")
+                    text = read_submission(submission).decode("utf-8", errors="replace")
                     origin_by_number |= read_gradescope_metadata(text)
                 except ResultsError as error:
                     notes.append(str(error))
-    if other_names:
-        names_text = join_first(other_names, MAX_LISTED_FILES)
-        notes.append(f"Ignored files (not PDF): {len(other_names)} ({names_text}).")
+    if ignored_names:
+        names_text = join_first(ignored_names, MAX_LISTED_FILES)
+        notes.append(f"Ignored files (not PDF): {len(ignored_names)} ({names_text}).")
     if zip_count:
         notes.append(
             f"Zip files not opened: {zip_count}. Name each exported zip file on the command line."
@@ -149,11 +149,16 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
     submissions = sorted(
         submission_by_path.values(),
-        key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
+        key=lambda submission: (
+            submission.name.casefold(),
+            submission.name,
+            submission.file,
+            submission.zip_entry,
+        ),
     )
     names = make_unique(_short_name(submission.name) for submission in submissions)
     named_submissions = [
-        replace(each, name=name) for each, name in zip(submissions, names, strict=True)
+        replace(submission, name=name) for submission, name in zip(submissions, names, strict=True)
     ]
     return tuple(add_origins(named_submissions, origin_by_number)), tuple(notes)
 
@@ -167,7 +172,10 @@ def add_origins(
     matches most of them, so that a student cannot imitate the file names of another platform.
     ``origin_by_number`` contains students and times by Gradescope's submission number.
     """
-    exports = [item.file if item.zip_entry else item.name.partition("/")[0] for item in submissions]
+    exports = [
+        submission.file if submission.zip_entry else submission.name.partition("/")[0]
+        for submission in submissions
+    ]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
     for export, submission in zip(exports, submissions, strict=True):
         platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
@@ -181,7 +189,7 @@ def add_origins(
         yield replace(submission, origin=origin)
 
 
-def read(submission: Submission) -> bytes:
+def read_submission(submission: Submission) -> bytes:
     """Read a submission of at most :data:`~px4fuse.verification.pdf_input.MAX_PDF_BYTES` bytes.
 
     Raises
@@ -204,7 +212,7 @@ def read(submission: Submission) -> bytes:
     return content
 
 
-def _is_metadata(name: str) -> bool:
+def _is_gradescope_metadata(name: str) -> bool:
     *folders, file = name.split("/")
     is_submitted = any(folder.startswith("submission_") for folder in folders)
     return file == GRADESCOPE_METADATA and not is_submitted
@@ -244,8 +252,8 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     except _UNREADABLE_ERRORS as error:
         notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
         return []
-    last_by_name = {entry.filename: entry for entry in entries}
-    if len(entries) > len(last_by_name):
+    last_entry_by_name = {entry.filename: entry for entry in entries}
+    if len(entries) > len(last_entry_by_name):
         (name, _), *_ = Counter(entry.filename for entry in entries).most_common(1)
         raise SettingsError(
             f"{_short_name(path.name)} contains two files with the name {_short_name(name)}: a "
@@ -254,7 +262,7 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
         )
     submissions = (
         Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
-        for name, entry in last_by_name.items()
+        for name, entry in last_entry_by_name.items()
     )
     return [
         submission
@@ -312,7 +320,11 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
         # zipfile decodes names without UTF-8 flag as code page 437, but most programs write UTF-8
         with suppress(UnicodeError):
             name = name.encode("cp437").decode("utf-8")
-    folders = (each for each in re.split(r"[/\\]", name) if each not in ("", ".", ".."))
+    folders = (
+        folder_name
+        for folder_name in re.split(r"[/\\]", name)
+        if folder_name not in ("", ".", "..")
+    )
     return "/".join(folder for folder in folders if folder[1:] != ":")
 
 
@@ -340,11 +352,11 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _short_name(name: str) -> str:
-    line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
-    if len(line) > MAX_NAME_LENGTH:
+    short_name = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
+    if len(short_name) > MAX_NAME_LENGTH:
         half_length = MAX_NAME_LENGTH // 2
-        line = f"{line[:half_length]}…{line[1 - half_length :]}"
-    return line or "no name"
+        short_name = f"{short_name[:half_length]}…{short_name[1 - half_length :]}"
+    return short_name or "no name"
 
 
 # ------------------------------------------------------------------ student and time in exports
@@ -368,19 +380,19 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
             match = PLATFORMS[platform].match(remaining_path)
             if match is None:
                 continue
-            fields = {key: value or "" for key, value in match.groupdict().items()}
-            time_text = fields.get("time", "")
+            name_parts = {key: value or "" for key, value in match.groupdict().items()}
+            time_text = name_parts.get("time", "")
             try:
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
             except ValueError:  # a platform writes valid times, so a student wrote this name
                 continue
-            names = (fields.get(key) for key in ("name", "first", "last"))
-            numbers = {platform: fields["number"]} if "number" in fields else {}
-            full_name, login = " ".join(filter(None, names)), fields.get("login", "")
+            person_names = (name_parts.get(key) for key in ("name", "first", "last"))
+            numbers = {platform: name_parts["number"]} if "number" in name_parts else {}
+            full_name, login = " ".join(filter(None, person_names)), name_parts.get("login", "")
             person = Person("", full_name, "", login, numbers)
             expected_count = platform in ("moodle", "blackboard")
             is_imitated = len(_PLATFORM_NAMES.findall(name)) > expected_count
-            return ExportOrigin(platform, person, time, bool(fields.get("late")), is_imitated)
+            return ExportOrigin(platform, person, time, bool(name_parts.get("late")), is_imitated)
         remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_SUBMITTER
 

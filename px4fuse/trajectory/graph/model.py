@@ -13,10 +13,9 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a direction that is
-# measured
+# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a measured direction
 MIN_OBSERVED_EIGENVALUE = 1e-9
-# Sources of the initial poses
+# Sources of the initial poses of a pose graph
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "composed odometry edges"
 FROM_CHORDAL = "chordal initialisation"
@@ -39,7 +38,7 @@ class PoseGraph:
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
     information: Array
-    # Source of the poses
+    # Source of the initial poses
     initialised: str = FROM_FILE
 
     __repr__ = one_line_repr

@@ -15,22 +15,21 @@ from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equat
 MAX_ITERATIONS = 100
 # Initial damping of Levenberg-Marquardt, as in GTSAM
 _INITIAL_DAMPING = 1e-5
-# Factor on the damping after a rejected step, as in GTSAM
+# Factor on the damping of Levenberg-Marquardt after a rejected step, as in GTSAM
 _DAMPING_FACTOR = 10.0
-# Maximum damping, as in GTSAM
+# Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
-# Minimum ratio of the decrease of the cost to its predicted decrease for accepting a step, as in
-# GTSAM
+# Minimum ratio of actual to predicted decrease of the cost for accepting a step, as in GTSAM
 _MIN_FIDELITY = 1e-3
-# Tolerance of the cost, relative and absolute
+# Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# Tolerance in the intermediate stages of graduated non-convexity, which need less precision
+# Relative tolerance of the cost in an intermediate stage of graduated non-convexity
 _STAGE_TOLERANCE = 1e-6
 # Maximum number of iterations in an intermediate stage of graduated non-convexity
 _MAX_STAGE_ITERATIONS = 20
 
-# Probability that the squared residual of a true closure is not truncated
+# Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
 # Probability that the cost of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
