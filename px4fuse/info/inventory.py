@@ -189,7 +189,7 @@ def take_inventory(flight: Flight) -> Inventory:
     )
 
 
-def to_plain(inventory: Inventory) -> dict[str, Any]:
+def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     """Convert the inventory of a log to JSON types, without unknown values."""
     inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
     flight: Flight = inventory_fields.pop("flight")
