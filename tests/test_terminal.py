@@ -281,9 +281,8 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
     page.parent.mkdir()
     page.write_bytes(mine)
-    assert f"{page} exists and was not overwritten, because it is not a web page of" in error_line(
-        *command.split()
-    )
+    message = error_line(*command.split())
+    assert f"{page} exists and was not overwritten, because the file is not a page of" in message
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine
