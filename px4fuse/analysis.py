@@ -109,7 +109,7 @@ class WhatIfAnalysis:
     __repr__ = one_line_repr
 
     @property
-    def sweep_start(self) -> int:
+    def sweep_start_index(self) -> int:
         """Index of the first replay of the sweep in ``whatif.whatif``."""
         return int(bool(self.changes or self.without))
 
@@ -120,11 +120,11 @@ def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
     A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
     biased or not fused for too long.
     """
-    failed = {}
+    failed_verdicts = {}
     if isinstance(analysis, Analysis):
         for name, axis in analysis.axes.items():
             ekf2 = axis.filters["ekf2"]
             if not isinstance(ekf2, Unavailable) and ekf2.verdict == "overconfident":
-                failed[f"EKF2, {name}"] = ekf2.verdict
+                failed_verdicts[f"EKF2, {name}"] = ekf2.verdict
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    return failed | {aid.label: aid.verdict for aid in aids.values() if aid.is_faulty}
+    return failed_verdicts | {aid.label: aid.verdict for aid in aids.values() if aid.is_faulty}

@@ -48,7 +48,7 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
@@ -92,17 +92,17 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     For a flight that is an assignment, the result contains only the comparison.
     """
     if comparison.flight.log.is_assessed:
-        withheld_parts: dict[str, Any] = {
-            field.name: WITHHELD for field in fields(Analysis) if field.default is MISSING
+        withheld_fields: dict[str, Any] = {
+            field.name: DIAGNOSIS_WITHHELD for field in fields(Analysis) if field.default is MISSING
         }
-        known_parts = {
+        known_fields = {
             **vars(comparison),
-            "tuning": {HORIZONTAL: WITHHELD},
-            "difference_steps": dict.fromkeys(comparison.axes, WITHHELD),
+            "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
+            "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
             "trials": (),
             "events": collect_events(comparison),
         }
-        return Analysis(**withheld_parts | known_parts)
+        return Analysis(**withheld_fields | known_fields)
     estimates = estimate(comparison, progress)
     comparison = refine_delay(comparison, estimates.clock)
     reruns = rerun(comparison, estimates, progress)
@@ -130,13 +130,13 @@ def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Co
     if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
         return comparison
     # a time offset is negative if the timestamps are late
-    refined = structs.replace(comparison.convention, late_s=-clock.offset_s)
+    refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
     # a refined delay that is too small for a finding would hide the correction of the timestamps
     is_fault = all(
         convention_faults(convention, comparison.flight, comparison.source.frame).late_s
-        for convention in (comparison.convention, refined)
+        for convention in (comparison.convention, refined_convention)
     )
-    return replace(comparison, convention=refined) if is_fault else comparison
+    return replace(comparison, convention=refined_convention) if is_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -150,26 +150,26 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log_path = Path(request.log)
     progress(f"reading {display_name(log_path)}")
     flight = read_log(log_path, system=request.system)
-    position, offset = request.position, request.clock_offset_s
-    if position is None:
+    requested_file, requested_offset = request.position, request.clock_offset_s
+    if requested_file is None:
         return flight
     # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
     from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
     from px4fuse.readers.position_file import read_position_file  # noqa: PLC0415
 
     position_file = read_position_file(
-        position.path,
-        columns=position.columns,
-        body=position.body,
-        time_unit=position.time_unit,
-        length_unit=position.length_unit,
+        requested_file.path,
+        columns=requested_file.columns,
+        body=requested_file.body,
+        time_unit=requested_file.time_unit,
+        length_unit=requested_file.length_unit,
     )
-    clock_offset_s = None if isinstance(offset, str) else offset
+    clock_offset_s = None if isinstance(requested_offset, str) else requested_offset
     return align_position_file(
         flight,
         position_file,
-        frame=position.frame,
-        yaw_deg=position.yaw_deg,
+        frame=requested_file.frame,
+        yaw_deg=requested_file.yaw_deg,
         clock_offset_s=clock_offset_s,
     )
 
@@ -270,19 +270,21 @@ def run_what_if(
         the log, or a parameter is unknown or out of PX4's range.
     """
     changes, sweep = check_parameters(request.changes), request.sweep
-    values: list[float] = []
+    swept_values: list[float] = []
     if sweep is not None:
-        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        swept_values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
         if sweep.parameter in changes:
             raise SettingsError(
                 f"{sweep.parameter} has both a new value and a sweep.",
                 f"Give a value or a sweep of {sweep.parameter}.",
             )
-    recordings = ComparisonRequest(log=request.log, system=request.system)
-    flight = flight or read_flight(recordings, progress)
+    comparison_request = ComparisonRequest(log=request.log, system=request.system)
+    flight = flight or read_flight(comparison_request, progress)
     is_default_change = not changes and sweep is None and not request.without
     if flight.log.is_assessed and is_default_change:
-        raise MissingDataError(f"{flight.log.name}: {WITHHELD.reason}", "Give --set or --sweep.")
+        raise MissingDataError(
+            f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
+        )
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
@@ -291,9 +293,9 @@ def run_what_if(
     comparison = None
     try:
         if model.agreement.good and not flight.log.is_assessed:
-            recordings = structs.replace(recordings, axes=("north", "east", AISLE))
-            prepared = prepare(flight, recordings)
-            comparison = compare(prepared, run_kf(prepared))
+            comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
+            prepared_comparison = prepare(flight, comparison_request)
+            comparison = compare(prepared_comparison, run_kf(prepared_comparison))
     except MissingDataError:  # changes that the user gave need no estimates
         if is_default_change:
             raise
@@ -303,10 +305,12 @@ def run_what_if(
         difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
-    settings = [changes] if changes or request.without else []
-    settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
+    parameter_sets = [changes] if changes or request.without else []
+    parameter_sets += (
+        [{**changes, sweep.parameter: value} for value in swept_values] if sweep else []
+    )
     progress("replaying EKF2 with other parameters")
-    replays = what_if(model, settings, request.without)
+    replays = what_if(model, parameter_sets, request.without)
     if isinstance(replays, Unavailable):
         raise MissingDataError(
             f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy

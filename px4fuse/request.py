@@ -18,7 +18,7 @@ AUTO: Literal["auto"] = "auto"
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# Kind of a position source that the user may state, as the messages in a log can be ambiguous
+# Kinds of position source that the user can choose, because the messages in a log are ambiguous
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Directions of x, y and z in a position file, such as east, up and south
 PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
@@ -26,7 +26,7 @@ PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
 HeightName = Literal["gnss", "barometer"]
 # Coordinate frame of a trajectory file
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
-System = Annotated[int, msgspec.Meta(ge=0, le=255)]
+SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
 class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -59,15 +59,15 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 # Fields of requests that contain a path
-_PATHS = ("log", "source", "estimate", "reference")
+_PATH_FIELDS = ("log", "source", "estimate", "reference")
 
 
-class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of all requests."""
 
     def without_paths(self) -> Self:
         """Return the request with file names instead of paths, as the results contain it."""
-        paths = {name: getattr(self, name, None) for name in _PATHS}
+        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
         changes: dict[str, Any] = {
             field_name: _file_name(path) for field_name, path in paths.items() if path is not None
         }
@@ -78,7 +78,7 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ComparisonRequest(
-    _RequestBase, frozen=True, kw_only=True, tag_field="command", tag="compare"
+    _BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="compare"
 ):
     """Request to compare KF with EKF2: ``px4fuse compare``, ``tune`` or ``sync``.
 
@@ -86,7 +86,7 @@ class ComparisonRequest(
     """
 
     log: str
-    system: System | None = None
+    system: SystemId | None = None
     position: PositionFile | None = None
     position_source: str | None = None
     source_kind: SourceKind | None = None
@@ -126,7 +126,7 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_m: float = 0.10
 
 
-class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="loop"):
+class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="loop"):
     """Request to measure and correct a loop closure error: ``px4fuse loop``.
 
     Attributes
@@ -154,7 +154,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
     source: str
     frame: FrameName | None = None
-    system: System | None = None
+    system: SystemId | None = None
     reference: str | None = None
     start_s: float | None = None
     end_s: float | None = None
@@ -175,7 +175,7 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     count: int = 9
 
 
-class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
+class WhatIfRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
     """Request to replay EKF2 with changed parameters: ``px4fuse whatif``.
 
     Attributes
@@ -194,13 +194,13 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
     """
 
     log: str
-    system: System | None = None
+    system: SystemId | None = None
     changes: dict[str, float] = {}
     sweep: Sweep | None = None
     without: dict[str, float] = {}
 
 
-class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
+class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
     """Request to compute ATE and RPE of a trajectory: ``px4fuse evaluate``.
 
     Attributes
@@ -225,7 +225,7 @@ class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
     time_offset_s: float | Literal["auto"] | None = None
     rpe: tuple[str, ...] = ()
     consecutive: bool = False
-    system: System | None = None
+    system: SystemId | None = None
 
 
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
@@ -243,18 +243,18 @@ _POSITION_OPTIONS = {
 
 
 def _option_names(
-    kind: type[msgspec.Struct], excluded: Sequence[str] = (), **exceptions: str
+    request_type: type[msgspec.Struct], excluded: Sequence[str] = (), **renamed_options: str
 ) -> dict[str, str]:
     """Return the command line option of each optional field of a request, by field name.
 
-    An option is the field name with hyphens and without unit, except for ``exceptions``.
+    An option is the field name with hyphens and without unit, except for ``renamed_options``.
     """
-    names = {
+    option_names = {
         field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
-        for field in msgspec.structs.fields(kind)
+        for field in msgspec.structs.fields(request_type)
         if not field.required and field.name not in excluded
     }
-    return names | exceptions
+    return option_names | renamed_options
 
 
 # Command line option for each field of a request that is not an argument of the command
@@ -274,8 +274,8 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Options of arguments in error messages that are not options of one request only
-_ARGUMENTS = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
+# Option of each argument that the errors of several commands contain
+_SHARED_OPTION_NAMES = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 
 def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
@@ -284,8 +284,8 @@ def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
     """
-    names = {**_ARGUMENTS, **option_names}
-    return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), text)
+    all_option_names = {**_SHARED_OPTION_NAMES, **option_names}
+    return re.sub(r"`(\w+)`", lambda match: all_option_names.get(match[1], match[0]), text)
 
 
 def command_line(

@@ -61,7 +61,7 @@ def in_this_process(monkeypatch) -> None:
     """
 
     for module in (grading, workers):
-        monkeypatch.setattr(module, "run_bounded", run_in_turn)
+        monkeypatch.setattr(module, "run_with_limits", run_in_turn)
 
 
 def write_zip(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:

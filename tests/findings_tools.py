@@ -84,7 +84,7 @@ def source(**parts: Any) -> Any:
     usual = {
         "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
         "frame": "NED",
-        "clock_map": None, "alignment": None, "rate_hz": 5.0, "age_s": 0.0,
+        "clock_map": None, "alignment": None, "rate_hz": 5.0, "assumed_delay_s": 0.0,
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
         "invalid": NO_INVALID_ROWS,
     }  # fmt: skip

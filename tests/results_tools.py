@@ -8,7 +8,7 @@ from typing import Any
 from px4fuse.core.record import Unavailable
 from px4fuse.loop.model import Closure, CorrectedPath, Loop, OdometryNoise, TrueEnd
 from px4fuse.request import LoopRequest
-from px4fuse.results.contract import LoopResults, Results, to_plain
+from px4fuse.results.contract import LoopResults, Results, to_json_dict
 from px4fuse.results.model import Student, provenance, schema_of
 from px4fuse.results.reading import read_results
 from px4fuse.trajectory.alignment import Transform
@@ -43,7 +43,7 @@ def correction(rmse: float, moved_m: float) -> CorrectedPath:
     )
 
 
-LOOP = to_plain(
+LOOP = to_json_dict(
     LoopResults(
         schema=schema_of("px4fuse-loop"),
         request=LoopRequest(source="loop.ulg:vio"),

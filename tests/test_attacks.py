@@ -97,7 +97,7 @@ class Flight:
 @pytest.fixture
 def _compare_pages_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compare pages in this process; test_pages.py tests the separate one."""
-    monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
+    monkeypatch.setattr(pages, "run_one_with_limits", lambda function, job, *_: function(job))
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ from px4fuse.batch.run import BatchResult, load_cached_rows
 from px4fuse.batch.terminal import format_summary
 from px4fuse.cli.outputs import terminal
 from px4fuse.core import workers
-from px4fuse.core.workers import JobFailure, run_bounded
+from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
@@ -57,7 +57,7 @@ def one_worker(monkeypatch) -> None:
 @pytest.fixture
 def in_this_process(monkeypatch) -> None:
     """Run jobs in the process of the test."""
-    monkeypatch.setattr(run, "run_bounded", run_in_turn)
+    monkeypatch.setattr(run, "run_with_limits", run_in_turn)
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def flights(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def undisturbed(flights, memory, tmp_path_factory) -> pd.DataFrame:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "run_bounded", run_in_turn)
+        patch.setattr(run, "run_with_limits", run_in_turn)
         remember(patch, memory)
         return px4fuse.run_batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
 
@@ -502,7 +502,7 @@ def assert_failed_job_does_not_affect_others(address):
     """Assert that other jobs succeed, also after a worker was killed."""
     # jobs that end at once or never: reporting an exception takes seconds of imports
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
-    work = partial(run_bounded, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
+    work = partial(run_with_limits, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
     expected = [9, "could not be unpickled (ValueError)", "exit code 3", "limit of 5 s", 16]
     with connect_cluster(address) as client:
         found = []

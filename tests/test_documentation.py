@@ -58,7 +58,7 @@ def test_documented_commands_run_in_given_order(page: str, monkeypatch, tmp_path
     """Commands that README contains too run only for README."""
     if page == "docs/instructors.md":
         pytest.skip("test_instructor_guide_commands_run_in_given_order makes the inputs")
-    monkeypatch.setattr(run, "run_bounded", run_in_turn)
+    monkeypatch.setattr(run, "run_with_limits", run_in_turn)
     readme_commands = commands("README.md") if page != "README.md" else []
     for number, line in enumerate(line for line in commands(page) if line not in readme_commands):
         if line == "px4fuse practice":

@@ -42,7 +42,7 @@ from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
     effective_settings,
-    fuses_by_mask,
+    uses_aid_mask,
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
@@ -84,7 +84,7 @@ def test_ekf2_parameters_missing_in_log_have_px4_defaults():
     assert (
         effective_settings({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
     )
-    assert not fuses_by_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
+    assert not uses_aid_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
 
 @pytest.mark.parametrize(("name", "fits", "not_fits"), [
@@ -126,11 +126,12 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
-        fusing: Any = NONE, per_step_biases: bool = False, without: Any = (), **parameters: float,
+        fusing: Any = NONE, stores_bias_increments: bool = False, without: Any = (),
+        **parameters: float,
     ) -> Any:  # fmt: skip
         record = made(
-            FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases,
-            flow=pd.DataFrame(),
+            FusionRecord, parameters=parameters, other_horizontal_aids=(),
+            stores_bias_increments=stores_bias_increments, flow=pd.DataFrame(),
         )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame({"rejected": []})},
@@ -150,7 +151,7 @@ def test_ekf2_fusion_rules_depend_on_px4_release(flown):
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
-    old = flown(EKF2_AID_MASK=8.0, per_step_biases=True)
+    old = flown(EKF2_AID_MASK=8.0, stores_bias_increments=True)
     assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)

@@ -164,7 +164,7 @@ def test_ekf2_model_without_required_topic_states_reason(sample_flight: Flight) 
     ekf2 = sample_flight.ekf2
     missing = Unavailable("IMU", "no topic sensor_combined", "Record it.")
     assert "sensor_combined" in unavailable(replace(sample_flight, imu=missing))
-    assert "GPS" in unavailable(with_record(sample_flight, other_aiding=("GPS",)))
+    assert "GPS" in unavailable(with_record(sample_flight, other_horizontal_aids=("GPS",)))
     bare = replace(ekf2, record=Unavailable("record", "no estimator_states", "Record it."))
     assert "estimator_states" in unavailable(replace(sample_flight, ekf2=bare))
     slow = sample_flight.imu.iloc[::5]

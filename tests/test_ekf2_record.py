@@ -34,7 +34,7 @@ def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation)
     assert row["north_m_s"] == pytest.approx(0.5)
     assert row["down_m"] == pytest.approx(-1.5)
     old = generation in ("v1.12", "v1.14")
-    assert record.per_step_biases == old
+    assert record.stores_bias_increments == old
     per = ekf2.step_s if old else 1.0
     assert row[Columns.GYRO_BIAS].to_numpy() == pytest.approx(np.array([1, 2, 3]) * 1e-4 / per)
     bias = row[Columns.ACCELEROMETER_BIAS].to_numpy()
@@ -80,10 +80,10 @@ def test_read_ekf2_record_lists_other_aiding_sources(read, flag, names):
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)
     flags[flag] = used.copy()
-    assert read(log).ekf2.record.other_aiding == ()
+    assert read(log).ekf2.record.other_horizontal_aids == ()
     used[4] = True
     flags[flag] = used
-    assert read(log).ekf2.record.other_aiding == names
+    assert read(log).ekf2.record.other_horizontal_aids == names
 
 
 def test_vision_age_is_publication_time_minus_sample_time(read):

@@ -16,7 +16,7 @@ from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.batch.page import html_text, logs_of, sort_logs
+from px4fuse.batch.page import html_text, logs_from_table, sort_logs
 from px4fuse.html.frame import MAX_PAGE_ROWS
 from px4fuse.report.card_html import MARK_PATHS
 
@@ -63,7 +63,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
             name=["a", "b", "c", "d"],
         )
     )
-    assert [log["name"] for log in sort_logs(logs_of(table))] == ["c", "d", "b", "a"]
+    assert [log["name"] for log in sort_logs(logs_from_table(table))] == ["c", "d", "b", "a"]
 
 
 def test_batch_page_row_shows_diagnosis_action_and_sigma_ratios() -> None:
@@ -158,7 +158,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click("tbody tr:first-child .name")
     ratios = {
         log["name"]: log["kf_source_ratio"]
-        for log in sort_logs(logs_of(artificial_logs(240)))
+        for log in sort_logs(logs_from_table(artificial_logs(240)))
         if "kf_source_ratio" in log
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
@@ -220,7 +220,7 @@ def test_batch_page_without_javascript_shows_a_table(browser: Browser, tmp_path:
     text = browser.ask("document.body.innerText")
     assert "The first 300 of 400 logs." in text
     assert "The table fleet.csv contains all rows." in text
-    names = [log["name"] for log in sort_logs(logs_of(artificial_logs(400)))]
+    names = [log["name"] for log in sort_logs(logs_from_table(artificial_logs(400)))]
     table = text.split("Enable JavaScript")[1]
     assert [name in table for name in names] == [True] * 300 + [False] * 100
 

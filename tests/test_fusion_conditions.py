@@ -16,7 +16,7 @@ from px4fuse.flight.log import ClockMap
 from px4fuse.flight.model import AidLog, Ekf2
 from px4fuse.flight.position_source import GNSS, POSITION_FILE
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import fused_aid
+from px4fuse.readers.px4_innovations import has_fused_aid
 
 SPAN_S = (20.0, 60.0)
 V114 = {"EKF2_EV_CTRL": 1.0, "EKF2_GPS_CTRL": 7.0}
@@ -174,9 +174,9 @@ def test_unmet_fusion_condition_of_logged_flight_is_found(
 
 def test_gnss_fusion_without_flags_follows_from_global_position() -> None:
     ekf2 = made(Ekf2, aids={}, states={"xy_global": on(1.0)})
-    assert fused_aid(ekf2)
-    assert not fused_aid(ekf2, "baro_hgt")
-    assert not fused_aid(made(Ekf2, aids={}, states={"xy_global": on(0.0)}))
+    assert has_fused_aid(ekf2)
+    assert not has_fused_aid(ekf2, "baro_hgt")
+    assert not has_fused_aid(made(Ekf2, aids={}, states={"xy_global": on(0.0)}))
     # flags without an aiding source mean that EKF2 did not fuse it
     flags = {"xy_global": on(1.0), "tilt_align": on(1.0)}
-    assert not fused_aid(made(Ekf2, aids={}, states=flags))
+    assert not has_fused_aid(made(Ekf2, aids={}, states=flags))

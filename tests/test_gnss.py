@@ -627,7 +627,9 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
 ])  # fmt: skip
 def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with_velocity):
     delayed = pd.DataFrame({"north_m": [north_m]})
-    record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
+    record = made(
+        FusionRecord, parameters=parameters, stores_bias_increments=False, delayed=delayed
+    )
     rules = _fusion_rules(record, 0.01, is_gnss=True)
     assert (rules.reset_variance_factor, rules.resets_velocity) == (scale, with_velocity)
     assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
@@ -641,7 +643,7 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
 ])  # fmt: skip
 def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
     source = SimpleNamespace(
-        origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid, frame="NED"
+        origin=GNSS, assumed_delay_s=age_s, alignment=None, aid=lambda _: GNSS.aid, frame="NED"
     )
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
     flight = SimpleNamespace(log=log)

@@ -91,7 +91,7 @@ def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch
         forged(REPORT.read_bytes(), lambda writer: writer.remove_page(REPORT_PAGES - 1))
     )
     monkeypatch.setattr(
-        pages, "run_one_bounded", lambda *_: JobFailure("it took longer than 10 s.")
+        pages, "run_one_with_limits", lambda *_: JobFailure("it took longer than 10 s.")
     )
     (only,) = grade(
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"

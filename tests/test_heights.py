@@ -395,7 +395,9 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
     p = (q + np.sqrt(q * q + 4.0 * q * 0.25)) / 2.0
     bias = {"bias_m": 1.7, "innovation_m": 0.0, "bias_m2": p * 0.25 / (p + 0.25)}
     bias = pd.DataFrame(bias | {"variance_m2": p + 0.25}, pd.Index(time_s[10::10]))
-    record = made(FusionRecord, height_bias={"baro_hgt": bias}, per_step_biases=False, states={})
+    record = made(
+        FusionRecord, height_bias={"baro_hgt": bias}, stores_bias_increments=False, states={}
+    )
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)
     log = made(AidLog, samples=rows if has_filter else rows.drop(columns="filtered_down"))
     ekf2 = made(Ekf2, state=state, aids={"baro_hgt": log})

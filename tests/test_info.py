@@ -20,7 +20,7 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight.log import Dropout, Sender
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.flight.position_source import GNSS
-from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
+from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inventory, to_json_dict
 from px4fuse.readers import read_log
 
 WIDTH = 80
@@ -245,7 +245,7 @@ def test_info_states_count_and_duration_of_gaps(tmp_path):
 def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
     """The flights have no streams; an analysis is possible exactly if compare performs it."""
     inventory = take_inventory(flight)
-    strict(json.dumps(to_plain(inventory)))
+    strict(json.dumps(to_json_dict(inventory)))
     try:
         comparison = compare(flight)
     except Px4FuseError:
@@ -302,7 +302,7 @@ def test_info_describes_or_rejects_each_test_log(shared_logs, monkeypatch, capsy
         assert widest(out) <= WIDTH, path.name
         (inventory,) = taken
         taken.clear()
-        strict(json.dumps(to_plain(inventory)))
+        strict(json.dumps(to_json_dict(inventory)))
         assert len(inventory.abilities) == 8, path.name
         assert all(a.reason for a in inventory.abilities), path.name
         try:
@@ -322,7 +322,7 @@ def test_info_succeeds_on_log_without_any_single_topic(sample_log, tmp_path):
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])
     for name in sorted(short.names()):
         less = Log([t for t in short.topics if t.name != name], whole.parameters, whole.info)
-        text = json.dumps(to_plain(inventory_of(less, tmp_path)))
+        text = json.dumps(to_json_dict(inventory_of(less, tmp_path)))
         strict(text)
     at = stamps(2.0, 10.0)
     other = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])

@@ -23,7 +23,7 @@ from px4fuse.loop.corrections import (
 )
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
-from px4fuse.loop.tracks import LoopSource, read_source, split_part
+from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
 from px4fuse.request import GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory, TrajectoryKind
@@ -400,8 +400,8 @@ def test_loop_with_invalid_segment_or_closure_is_rejected(sample, how, says) -> 
 
 
 def test_trajectory_argument_is_split_into_log_and_source(tmp_path: Path) -> None:
-    assert split_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
-    assert split_part(str(SAMPLE)) == (SAMPLE, None)
+    assert split_path_and_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
+    assert split_path_and_part(str(SAMPLE)) == (SAMPLE, None)
     odd = tmp_path / "a:vio"
     odd.write_bytes(b"")
-    assert split_part(str(odd)) == (odd, None)
+    assert split_path_and_part(str(odd)) == (odd, None)

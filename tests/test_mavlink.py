@@ -509,7 +509,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
         True,
         True,
     )
-    assert track.age_s == pytest.approx(0.11)
+    assert track.assumed_delay_s == pytest.approx(0.11)
     true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
     exact_m = 0.02 if clock is same else 0.03
     assert track.samples[Columns.POSITION].to_numpy() == pytest.approx(true, abs=exact_m)

@@ -243,7 +243,7 @@ def test_read_mavlink_counts_unknown_frames_and_bad_bytes(
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert frames.sequence.tolist() == [*good]
     assert frames.unknown_frame_count == unknown_frame_count
-    assert frames.bad_bytes == bad * (len(BEATS[4]) + 8 * with_stamps)
+    assert frames.bad_byte_count == bad * (len(BEATS[4]) + 8 * with_stamps)
 
 
 @pytest.mark.parametrize(("share", "is_stated"), [(0.002, False), (0.005, True)])
@@ -282,7 +282,7 @@ def test_invalid_bytes_between_mavlink_frames_are_skipped(read, junk):
     parts = beats(6)
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
     assert frames.sequence.tolist() == list(range(6))
-    assert frames.bad_bytes == len(junk)
+    assert frames.bad_byte_count == len(junk)
 
 
 def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
@@ -296,7 +296,7 @@ def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
     parts[3] = stamp(START_US)[:3] + b"\xfe" + body[:4] + true
     frames = read(b"".join(parts))
     assert names(frames) == ["HEARTBEAT"] * 3 + ["ATTITUDE"] + ["HEARTBEAT"] * 2
-    assert frames.bad_bytes == 0
+    assert frames.bad_byte_count == 0
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
@@ -309,7 +309,7 @@ def test_mavlink_frame_inside_payload_is_ignored(read, with_stamps):
     parts = [*beats(2), frame(outer), *beats(2), frame(filled), *beats(2)]
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert Counter(names(frames)) == {"HEARTBEAT": 6, "TUNNEL": 2}
-    assert frames.bad_bytes == 0
+    assert frames.bad_byte_count == 0
     carried = decoded(frames, "TUNNEL")["payload"][0]
     assert bytes(carried[: len(inner)]) == inner
 
@@ -320,7 +320,7 @@ def test_incomplete_first_and_last_mavlink_frame_are_dropped(read):
     for cut in (1, 5, len(parts[0]) - 1):
         frames = read(whole[cut : len(whole) - cut])
         assert frames.sequence.tolist() == [1, 2, 3]
-        assert frames.bad_bytes == 2 * (len(parts[0]) - cut)
+        assert frames.bad_byte_count == 2 * (len(parts[0]) - cut)
     tlog = stamped(*parts)
     for cut in (3, 8, 12):
         frames = read(tlog[cut : len(tlog) - cut])
@@ -336,7 +336,7 @@ def test_damaged_tlog_receive_times_are_interpolated(read):
         times[at] = wrong
     content = b"".join(stamp(us) + part for us, part in zip(times, parts, strict=True))
     frames = read(content)
-    assert frames.damaged_receive_times == 3
+    assert frames.damaged_receive_time_count == 3
     assert frames.received_us.tolist() == [START_US + 1000 * i for i in range(9)]
 
 
@@ -346,7 +346,7 @@ def test_mavlink_file_of_a_single_message_is_read(read, with_stamps):
     frames = read(stamped(content) if with_stamps else content)
     assert len(frames) == 1
     assert (frames.received_us is not None) == with_stamps
-    assert frames.bad_bytes == 0
+    assert frames.bad_byte_count == 0
 
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))

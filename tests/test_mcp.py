@@ -28,7 +28,7 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED, NOTICE, PROMPTS, Server
 from px4fuse.results.contract import schema, to_json
 
@@ -431,7 +431,7 @@ def test_server_withholds_diagnosis_of_assigned_flight(tmp_path: Path) -> None:
         for tool in ("estimate_noise", "estimate_time_offset", "what_if"):
             refused = await client.call_tool(tool, {"log": "s01.ulg"})
             assert refused.is_error
-            assert WITHHELD.reason in text_of(refused)
+            assert DIAGNOSIS_WITHHELD.reason in text_of(refused)
 
     connect(started(folder=tmp_path), talk)
 

@@ -68,7 +68,7 @@ def pdf(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.fixture(autouse=True)
 def _in_this_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "time_limit" not in request.node.name:
-        monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
+        monkeypatch.setattr(pages, "run_one_with_limits", lambda function, job, *_: function(job))
 
 
 def equal_text(one: str, other: str) -> bool:

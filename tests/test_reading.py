@@ -97,7 +97,7 @@ def test_file_search_by_sha256_ignores_special_and_huge_files(desk, monkeypatch,
         found.append(work.keywords["logs"][log_sha256(report)])
         yield 0, Verification("verified", (), with_log=True, page_status="same")
 
-    monkeypatch.setattr(workers, "run_bounded", verify_nothing)
+    monkeypatch.setattr(workers, "run_with_limits", verify_nothing)
     monkeypatch.chdir(desk)
     with time_limit():
         code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")

@@ -27,7 +27,7 @@ from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_re
 from px4fuse.errors import ResultsError
 from px4fuse.findings import TITLES
 from px4fuse.results.answer_form import Answers, StudentMistake
-from px4fuse.results.contract import to_plain
+from px4fuse.results.contract import to_json_dict
 from px4fuse.simulation.flights import SIMULATION_HARDWARE
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
@@ -89,7 +89,7 @@ JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_chan
 OVERSTATED = changed_results(horizontal__kf__verdict="underconfident", horizontal__kf__nis_mean=0.5)
 UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 4.4}
 AFTER = "loop__corrections__by_distance"
-WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
+WORSE = {"slam.tum": to_json_dict(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed_results(
     LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}]
 )

@@ -27,10 +27,10 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
-from px4fuse.flight.log import SHARED_STAMPS, ClockMap
+from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
 from px4fuse.flight.model import Columns, Flight
 from px4fuse.readers import read_log
-from px4fuse.readers.common import find_invalid, rounding_step
+from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse_mistakes
@@ -54,7 +54,7 @@ def track(count: int = 60) -> pd.DataFrame:
 
 def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
     """Return the row numbers of invalid positions by reason."""
-    reason = find_invalid(samples, ["x", "y", "z"]).to_numpy()
+    reason = find_invalid_rows(samples, ["x", "y", "z"]).to_numpy()
     return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
 
 
@@ -202,7 +202,9 @@ FAULTS = {
     "source_two_senders": alternating,
     "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
     "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
-    "source_timestamps_shared": lambda flight: with_clock(flight, "local", SHARED_STAMPS, 120),
+    "source_timestamps_shared": lambda flight: with_clock(
+        flight, "local", REPEATED_TIMESTAMPS, 120
+    ),
     "source_position_held": lambda flight: without_rows(flight, "held"),
     "source_zero_positions": lambda flight: without_rows(flight, "zero"),
     "source_without_position": lambda flight: without_rows(flight, "NaN"),
@@ -256,7 +258,9 @@ def test_timestamp_unit_finding_states_that_ekf2_never_fused():
 
 
 def test_equal_timestamps_finding_states_clock_resolution():
-    (one,) = detected(with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", SHARED_STAMPS, 120))
+    (one,) = detected(
+        with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS, 120)
+    )
     assert one.evidence["resolution_s"] == pytest.approx(1.0)
     assert "(5 Hz)" in one.message
 

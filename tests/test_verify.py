@@ -48,7 +48,7 @@ from results_tools import finding
 
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import to_json, to_plain
+from px4fuse.results.contract import to_json, to_json_dict
 from px4fuse.verification import pages, verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import (
@@ -70,7 +70,7 @@ LOOP_LOG = SAMPLES / "loop_vio.ulg"
 def _compare_pages_in_process() -> Iterator[None]:
     """Compare pages in this process; test_pages.py tests the separate one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
+        patch.setattr(pages, "run_one_with_limits", lambda function, job, *_: function(job))
         yield
 
 
@@ -265,7 +265,7 @@ def change_value(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, An
 def test_verify_finds_each_kind_of_changed_value(
     aisle: VerifiedReport, path: tuple[Any, ...]
 ) -> None:
-    found, *_ = compare_results(change_value(aisle.results, path), to_plain(aisle.again[0]))
+    found, *_ = compare_results(change_value(aisle.results, path), to_json_dict(aisle.again[0]))
     difference = found[0]  # an additional list has paths below this one
     assert difference.path.startswith(".".join(map(str, path)))
 

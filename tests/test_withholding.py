@@ -17,7 +17,7 @@ from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
 from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json
@@ -54,7 +54,9 @@ def test_report_of_assignment_contains_answers_not_findings(assigned: Assigned) 
     assert results.log.is_assessed is True
     assert (results.findings, results.trials, results.card.causes) == ((), (), ())
     assert results.card.facts == {"Answers": "Verdict on KF: consistent"}
-    assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {WITHHELD}
+    assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {
+        DIAGNOSIS_WITHHELD
+    }
     assert results.axes["aisle"].updates.count > 100
 
 
@@ -69,13 +71,13 @@ def test_report_of_assignment_contains_answers_not_findings(assigned: Assigned) 
     ],
 )
 def test_estimate_for_assignment_is_refused_in_one_line(assigned: Assigned, command: str) -> None:
-    assert WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
+    assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
 
 
 def test_loop_of_assignment_has_no_closure(assigned: Assigned, tmp_path: Path) -> None:
     run_checked("loop", assigned.log, "--json", tmp_path / "loop.json")
     data = json.loads((tmp_path / "loop.json").read_text(encoding="utf-8"))
-    assert data["loop"]["true_end"]["reason"] == WITHHELD.reason
+    assert data["loop"]["true_end"]["reason"] == DIAGNOSIS_WITHHELD.reason
     assert (data["loop"]["closures"], data["findings"]) == ([], [])
 
 

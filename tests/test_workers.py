@@ -13,14 +13,14 @@ import pytest
 from failing_jobs import run_job
 
 from px4fuse.core import workers
-from px4fuse.core.workers import JobFailure, run_bounded
+from px4fuse.core.workers import JobFailure, run_with_limits
 
 MEMORY = 1_500_000_000
 
 
 def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     outcomes = list(
-        run_bounded(
+        run_with_limits(
             run_job, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes
         )
     )
@@ -84,7 +84,7 @@ def test_worker_job_above_memory_limit_is_ended():
 
 
 def test_worker_process_is_replaced_after_maximum_job_count(monkeypatch):
-    monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
+    monkeypatch.setattr(workers, "MAX_JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
@@ -101,7 +101,9 @@ def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
 
 def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
-    with closing(run_bounded(run_job, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
+    with closing(
+        run_with_limits(run_job, jobs, processes=2, timeout_s=60, memory_bytes=None)
+    ) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
 
@@ -109,12 +111,12 @@ def test_closing_the_worker_pool_ends_all_processes():
 INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
-from px4fuse.core.workers import run_bounded
+from px4fuse.core.workers import run_with_limits
 from failing_jobs import run_job
 
 if __name__ == "__main__":
-    for _, result in run_bounded(run_job, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
-                                 memory_bytes=None):
+    for _, result in run_with_limits(run_job, [("process", 0), ("hang", 0)], processes=1,
+                                     timeout_s=500, memory_bytes=None):
         print(result, flush=True)
 """
 

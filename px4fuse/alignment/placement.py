@@ -23,7 +23,7 @@ from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.log import SHARED_STAMPS, ClockMap, InputFile
+from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap, InputFile
 from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
@@ -155,7 +155,7 @@ def _clock_with_shared_timestamps(recording: PositionRecording) -> ClockMap | No
     if distinct_count > MAX_DISTINCT_FRACTION * row_count:
         return None
     return ClockMap(
-        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct_count
+        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
     )
 
 

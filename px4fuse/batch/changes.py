@@ -23,7 +23,7 @@ from px4fuse.results.model import provenance, schema_of
 # Maximum √(mean NEES) of a consistent filter; the minimum is 1 / maximum. The limits are wide,
 # because errors in a flight are correlated and EKF2's output predictor delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
-# Label of each setting or property of a flight that px4fuse diff compares, and path in the results
+# Path in the results of each setting or flight property that px4fuse diff compares, by its label
 SETTING_LABELS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
     "SIGMA_Z (m)": "settings.sigma_z_m",
@@ -71,7 +71,7 @@ def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
         settings=tuple(_setting_changes(a.results, b.results)),
         numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
         findings=findings,
-        worse=tuple(_worse_verdicts(a.results, b.results, findings)),
+        worse=tuple(_describe_worse_verdicts(a.results, b.results, findings)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
     )
 
@@ -115,39 +115,42 @@ def compare_numbers(
         Numbers of A and B, by their path in the results.
     """
     for path in {**numbers_a, **numbers_b}:
-        a, b = numbers_a.get(path), numbers_b.get(path)
+        number_a, number_b = numbers_a.get(path), numbers_b.get(path)
         if (
-            a
-            and b
+            number_a
+            and number_b
             and math.isclose(
-                a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
+                number_a.value,
+                number_b.value,
+                rel_tol=RELATIVE_TOLERANCE,
+                abs_tol=ABSOLUTE_TOLERANCE,
             )
         ):
             continue
-        number = a or b
+        number = number_a or number_b
         assert number is not None
         yield contract.NumberChange(
             path=path,
             label=number.label,
             unit=number.unit,
-            a=getattr(a, "value", None),
-            b=getattr(b, "value", None),
-            a_interval=getattr(a, "interval", None),
-            b_interval=getattr(b, "interval", None),
+            a=getattr(number_a, "value", None),
+            b=getattr(number_b, "value", None),
+            a_interval=getattr(number_a, "interval", None),
+            b_interval=getattr(number_b, "interval", None),
         )
 
 
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
     """Yield the findings that only A or only B contains, compared by id and severity."""
-    pairs: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
-    for results, other_results, only_in in pairs:
-        ids = {(finding.id, finding.severity) for finding in other_results.findings}
+    comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
+    for results, other_results, only_in in comparisons:
+        other_findings = {(finding.id, finding.severity) for finding in other_results.findings}
         for finding in results.findings:
-            if (finding.id, finding.severity) not in ids:
+            if (finding.id, finding.severity) not in other_findings:
                 yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
 
 
-def _worse_verdicts(
+def _describe_worse_verdicts(
     a: Results, b: Results, findings: Iterable[contract.FindingChange]
 ) -> Iterator[str]:
     """Yield a sentence on each verdict that is worse in B, and on each error that only B has."""

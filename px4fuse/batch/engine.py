@@ -85,14 +85,14 @@ def _check_workers(client: Client) -> None:
 
 def run_jobs(
     client: Client | None,
-    run_list: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
+    run_job_list: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
     jobs: Sequence[Job],
     processes: int | None = None,
 ) -> Generator[tuple[Job, Result | JobFailure]]:
     """Run jobs on a Dask cluster, or on this computer if ``client`` is None.
 
-    ``run_list`` runs a list of jobs in ``processes`` processes (default: the number of cores). Each
-    job is returned with its result as soon as it is finished.
+    ``run_job_list`` runs a list of jobs in ``processes`` processes (default: the number of cores).
+    Each job is returned with its result as soon as it is finished.
 
     Raises
     ------
@@ -100,14 +100,14 @@ def run_jobs(
         The connection to the scheduler was lost.
     """
     if client is None:
-        for index, result in run_list(jobs, processes=processes):
+        for index, result in run_job_list(jobs, processes=processes):
             yield jobs[index], result
         return
     from distributed import as_completed  # noqa: PLC0415
 
     tasks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
     futures = dict(
-        zip(client.map(partial(_run_task, run_list), tasks, pure=False), tasks, strict=True)
+        zip(client.map(partial(_run_task, run_job_list), tasks, pure=False), tasks, strict=True)
     )
     try:
         for future in as_completed(list(futures)):
@@ -124,9 +124,11 @@ def run_jobs(
             client.cancel(list(futures))
 
 
-def _run_task(run_list: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
+def _run_task(
+    run_job_list: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]
+) -> list[Any]:
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
     # a Dask worker is a daemon process by default, which Python does not allow to start processes
     multiprocessing.current_process().daemon = False
-    results_by_index = dict(run_list(jobs, processes=1))
+    results_by_index = dict(run_job_list(jobs, processes=1))
     return [results_by_index[index] for index in range(len(jobs))]

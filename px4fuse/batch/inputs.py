@@ -21,7 +21,7 @@ Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from the results of one input to analyse the log of the other input
-_FILTER_FIELDS = {*Settings.__dataclass_fields__, "axes"}
+_FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
 # Settings that are not copied even if both inputs belong to the same log
 _FILE_FIELDS = {"log", "system", "position"}
 
@@ -47,7 +47,7 @@ def read_inputs(
     ResultsError
         An input cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
     """
-    first_input, second_input = (_read_attached(path) for path in (a, b))
+    first_input, second_input = (_read_given_results(path) for path in (a, b))
     if a.samefile(b):
         raise ResultsError(f"{display_name(a)}: A and B are the same file. Give two files.")
     return (
@@ -56,15 +56,15 @@ def read_inputs(
     )
 
 
-def _read_attached(path: Path) -> InputResults | None:
+def _read_given_results(path: Path) -> InputResults | None:
     """Read the results in a report (PDF) or a JSON file; return None for a log."""
     name, head = display_name(path), read_head(path, 64, LogError)
     is_report = head.startswith(b"%PDF-")
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return None
-    limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
+    limit_bytes = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     remedy = "Give a report (PDF) or the results (JSON) of px4fuse compare."
-    content = read_bytes_limited(path, ResultsError, limit, size_remedy=remedy)
+    content = read_bytes_limited(path, ResultsError, limit_bytes, size_remedy=remedy)
     results = (read_attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(
@@ -77,10 +77,13 @@ def _read_attached(path: Path) -> InputResults | None:
 def _analyse_log(path: Path, other_input: InputResults | None, progress: Progress) -> InputResults:
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
-        is_same = other_input.results.log.sha256 in files_by_sha256([path])
-        fields = {*request.__struct_fields__} - _FILE_FIELDS if is_same else _FILTER_FIELDS
+        is_same_log = other_input.results.log.sha256 in files_by_sha256([path])
+        copied_settings = (
+            {*request.__struct_fields__} - _FILE_FIELDS if is_same_log else _FILTER_SETTINGS
+        )
         request = replace(
-            request, **{name: getattr(other_input.results.request, name) for name in fields}
+            request,
+            **{name: getattr(other_input.results.request, name) for name in copied_settings},
         )
     result = diagnose_or_check_aids(request, progress)
     text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report

@@ -52,26 +52,30 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
 def _logs_in(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
-    file_system, root = _file_system(pattern)
+    file_system, root_path = _file_system(pattern)
     try:
-        if file_system.isdir(root):
-            all_files = file_system.find(root, detail=True)
+        if file_system.isdir(root_path):
+            all_files = file_system.find(root_path, detail=True)
             info_by_path = {
-                path: info
-                for path, info in all_files.items()
+                path: file_info
+                for path, file_info in all_files.items()
                 if path.lower().endswith(LOG_SUFFIXES)
             }
         # devices and pipes are included: the worker process that opens them reports an error
-        elif file_system.exists(root):
-            info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
+        elif file_system.exists(root_path):
+            info_by_path = {
+                root_path: file_system.info(root_path) if file_system.isfile(root_path) else {}
+            }
         else:
             all_files = (
-                file_system.glob(root, detail=True)
+                file_system.glob(root_path, detail=True)
                 if any(wildcard in pattern for wildcard in "*?[")
                 else {}
             )
             info_by_path = {
-                path: info for path, info in all_files.items() if info["type"] == "file"
+                path: file_info
+                for path, file_info in all_files.items()
+                if file_info["type"] == "file"
             }
     # fsspec raises other exceptions than OSError for URLs, such as an unknown account
     except Exception as error:
@@ -84,11 +88,11 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             f"Give existing logs, or folders with logs ({', '.join(LOG_SUFFIXES)}).",
         )
     found_logs = []
-    for path, info in info_by_path.items():
+    for path, file_info in info_by_path.items():
         address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
         is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
-        found_logs.append(LogAddress(_file_name(path), log, address, info.get("size")))
+        found_logs.append(LogAddress(_file_name(path), log, address, file_info.get("size")))
         if _is_local(file_system):
             add_input(Path(path))
     return found_logs
@@ -109,10 +113,10 @@ def local_file(address: str) -> Iterator[Path]:
     if _is_local(file_system):
         yield Path(path)
         return
-    size, limit = file_system.info(path).get("size"), max_log_bytes.get()
-    if size is not None and size > limit:
+    size_bytes, limit_bytes = file_system.info(path).get("size"), max_log_bytes.get()
+    if size_bytes is not None and size_bytes > limit_bytes:
         raise LogError(
-            f"the file has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
+            f"the file has {size_bytes / 1e6:,.0f} MB; the limit is {limit_bytes / 1e6:,.0f} MB",
             "Increase the limit with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:

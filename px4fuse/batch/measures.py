@@ -44,7 +44,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # omitted, because the numbers of each axis contain those of the position source
+    # aiding sources of the position source: the numbers of each axis contain theirs
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         source_aids = ("gnss_pos",)
@@ -52,9 +52,9 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     for measure in MEASURES:
         pattern, interval_field = measure["path"], measure["interval"]
         for path, names in _matching_paths(results, pattern):
-            record_path, _, field = path.rpartition(".")
+            record_path, _, field_name = path.rpartition(".")
             record, first_name = value_at(results, record_path), names[0] if names else ""
-            value = getattr(record, field, None)
+            value = getattr(record, field_name, None)
             is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = pattern.startswith("aids.") and first_name in source_aids
@@ -76,9 +76,9 @@ def _matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the paths that match a pattern, each with the names that replace ``*``."""
-    parent, has_wildcard, rest = pattern.partition(".*")
+    parent, has_wildcard, pattern_end = pattern.partition(".*")
     if not has_wildcard:
         yield pattern, ()
     for name in (value_at(results, parent) or ()) if has_wildcard else ():
-        for path, names in _matching_paths(results, f"{parent}.{name}{rest}"):
+        for path, names in _matching_paths(results, f"{parent}.{name}{pattern_end}"):
             yield path, (name, *names)

@@ -78,7 +78,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     made_with : str
         Name and version of px4fuse.
     """
-    logs = sort_logs(logs_of(table))
+    logs = sort_logs(logs_from_table(table))
     rows = [
         Row(_log_cells(log), tuple(log["tags"]), _log_details(log), _side_sections(log))
         for log in logs
@@ -185,10 +185,11 @@ def _log_details(log: Log) -> tuple[Section, ...]:
             is_warning=True,
         ),
         frame.list_section(
-            "Actions", list(dict.fromkeys(r for _, r in log["missing_results"] if r))
+            "Actions", list(dict.fromkeys(remedy for _, remedy in log["missing_results"] if remedy))
         ),
         frame.list_section(
-            "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
+            "Findings",
+            [f"{finding_title(finding_id)} ({finding_id})" for finding_id in log["findings"]],
         ),
         frame.table_section("Axes", titles if axes else (), axes, range(1, len(titles))),
     )
@@ -230,7 +231,7 @@ def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]
 # -------------------- combination of the table rows of each log
 
 
-def logs_of(table: pd.DataFrame) -> list[Log]:
+def logs_from_table(table: pd.DataFrame) -> list[Log]:
     """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):
@@ -244,7 +245,12 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     """Combine the rows of a log, one per axis; values of the main axes replace those of others."""
     axes = [row for row in rows if "axis" in row]
     main_rows = next(
-        (m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows
+        (
+            axis_rows
+            for names in MAIN_AXES
+            if (axis_rows := [row for row in axes if row["axis"] in names])
+        ),
+        rows,
     )
     log: dict[str, Any] = {}
     for row in reversed((*main_rows, *rows)):
@@ -257,10 +263,10 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "axes": axes,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
-    refused = log["status"] if log["status"] == NOT_COMPARED else "refused"
+    status_text = log["status"] if log["status"] == NOT_COMPARED else "refused"
     log |= {
         "severity": log.get("severity", "refused"),
-        "headline": log.get("headline", f"{refused}: {log.get('reason', '')}"),
+        "headline": log.get("headline", f"{status_text}: {log.get('reason', '')}"),
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
         "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
     }

@@ -21,7 +21,7 @@ from px4fuse.results.contract import ComparisonResults, Log
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
 # Name of the noise estimate of an axis: north and east have one estimate, "horizontal"
-_TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
+_NOISE_ESTIMATE_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
@@ -57,18 +57,18 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
     has_time_offset = bool(value_at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
-        unavailable = next(
+        missing_filter = next(
             (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
         )
         row = common_columns | {
             "axis": name,
             "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
-            "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
-            "remedy": unavailable.remedy if unavailable else "",
+            "reason": f"{missing_filter.what}: {missing_filter.reason}" if missing_filter else "",
+            "remedy": missing_filter.remedy if missing_filter else "",
         }
         for column, path in RESULT_PATHS.items():
             if column not in row and path and (has_time_offset or not path.startswith("clock.")):
-                tuned_axis = _TUNING_OF_AXIS.get(name, name)
+                tuned_axis = _NOISE_ESTIMATE_BY_AXIS.get(name, name)
                 row[column] = value_at(results, path.format(axis=name, tuned=tuned_axis))
         rows.append(row)
     return rows

@@ -31,14 +31,14 @@ from px4fuse.batch.rows import (
 )
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import max_log_bytes
-from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_bounded
+from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
 from px4fuse.core.writing import write_all
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import requested_settings
 from px4fuse.request import ComparisonRequest, command_line
 
 # Table columns with the paths of the outputs of a log, relative to the output folder
-FILE_COLUMNS = ("results", "report")
+OUTPUT_FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
 Progress = Callable[[str, int, int], None]
@@ -87,9 +87,9 @@ class _RunState:
     settings: str
     # SHA-256 of the logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # first of the logs with the same content, by SHA-256; only this log has table rows
+    # First log of each content, by SHA-256; identical logs have no table rows of results
     first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
-    # table rows of the logs that failed, by address
+    # Table row of each log that failed, by address
     failed_rows: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of the logs whose results are from an earlier run
     reused_hashes: set[str] = field(default_factory=set)
@@ -204,7 +204,7 @@ def run(
         for log in logs
     ]
     run_in_processes = partial(
-        run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
+        run_with_limits, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
     )
     with (
         connect_cluster(scheduler) as client,
@@ -220,8 +220,10 @@ def run(
                 if state.hash_by_address or state.failed_rows:
                     batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            is_kept = (output / "rows").is_dir()
-            raise type(error)(f"{error} {RESUME_NOTE if is_kept else ''}".rstrip()) from error
+            has_cached_rows = (output / "rows").is_dir()
+            raise type(error)(
+                f"{error} {RESUME_NOTE if has_cached_rows else ''}".rstrip()
+            ) from error
     return batch_result
 
 
@@ -231,7 +233,8 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
     for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
         first_row = cached_rows.rows[0]
         output_files = [
-            state.output / first_row.get(column, "") for column in FILE_COLUMNS[: 1 + reports]
+            state.output / first_row.get(column, "")
+            for column in OUTPUT_FILE_COLUMNS[: 1 + reports]
         ]
         if "axis" not in first_row or all(output_file.is_file() for output_file in output_files):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
@@ -267,15 +270,15 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFail
 
 
 def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
-    stem = f"results/{file_stem(log.name, outcome.sha256)}"
-    named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
-    files = {
-        kind: name if named_contents[name] else ""
-        for kind, name in zip(FILE_COLUMNS, named_contents, strict=True)
+    path_stem = f"results/{file_stem(log.name, outcome.sha256)}"
+    content_by_name = {f"{path_stem}.json": outcome.results, f"{path_stem}.pdf": outcome.report}
+    path_by_column = {
+        column: name if content_by_name[name] else ""
+        for column, name in zip(OUTPUT_FILE_COLUMNS, content_by_name, strict=True)
     }
-    rows = [clean_row(row) | files for row in outcome.rows]
+    rows = [clean_row(row) | path_by_column for row in outcome.rows]
     cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
-    contents = named_contents | {cached_rows.file: msgspec.json.encode(cached_rows)}
+    contents = content_by_name | {cached_rows.file: msgspec.json.encode(cached_rows)}
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_of, sort_logs
+from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_from_table, sort_logs
 from px4fuse.batch.rows import FAILED
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
@@ -37,9 +37,9 @@ def format_summary(batch_result: BatchResult) -> Page:
         page.write(template.format_map(reason).rstrip(), colour=colour)
     if (unlisted_count := len(reasons) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
-    sorted_logs = sort_logs(logs_of(batch_result.table))
+    sorted_logs = sort_logs(logs_from_table(batch_result.table))
     if sorted_logs:
-        rows = [_diagnosis(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
+        rows = [_diagnosis_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.table(
             ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
             rows,
@@ -58,7 +58,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     return page
 
 
-def _diagnosis(log: Log) -> tuple[Cell, ...]:
+def _diagnosis_row(log: Log) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
     ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
     return (

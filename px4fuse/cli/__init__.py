@@ -102,9 +102,9 @@ class LazyGroup(click.Group):
         except KeyboardInterrupt as interrupt:  # click would print an empty line
             raise Interrupted(interrupt, written_so_far(ctx)) from None
         except MemoryError as error:
-            raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
+            raise _make_system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
         except OSError as error:
-            raise _system_error(error, written_so_far(ctx)) from error
+            raise _make_system_error(error, written_so_far(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -132,22 +132,23 @@ def cli() -> None:
     """
 
 
-def _system_error(error: OSError, written: str) -> Px4FuseError:
+def _make_system_error(error: OSError, written_text: str) -> Px4FuseError:
     if error.errno == errno.ENOMEM:
         return Px4FuseError(
-            f"not enough memory; {written}", "Close other programs, or raise the limit (ulimit -v)."
+            f"not enough memory; {written_text}",
+            "Close other programs, or raise the limit (ulimit -v).",
         )
     try:
         Path.cwd()
     except OSError:
         return SettingsError(
-            f"the current folder no longer exists; {written}", "Change to another folder."
+            f"the current folder no longer exists; {written_text}", "Change to another folder."
         )
     if error.filename is not None:
         return OutputError(
-            f"The file {error.filename} cannot be used ({error.strerror}); {written}"
+            f"The file {error.filename} cannot be used ({error.strerror}); {written_text}"
         )
-    return OutputError(f"standard output cannot be written ({error.strerror}); {written}")
+    return OutputError(f"standard output cannot be written ({error.strerror}); {written_text}")
 
 
 def _check_memory() -> None:
@@ -177,9 +178,9 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
-            signal.signal(signal_number, _interrupt)
+            signal.signal(signal_number, _raise_interrupt)
     if hasattr(signal, "pthread_kill"):  # Windows does not have it
-        sys.unraisablehook = _interrupt_again
+        sys.unraisablehook = _raise_signal_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
             _check_memory()
@@ -198,7 +199,7 @@ def main() -> None:
         _print_error(str(interrupt))
         exit_code = interrupt.exit_code
     except BrokenPipeError:  # the program that reads the pipe has ended
-        _abandon_output()
+        _discard_output()
         exit_code = 0
     except OSError as error:  # click cannot print --help or --version
         _print_error(f"standard output cannot be written ({error.strerror}); nothing was written.")
@@ -223,7 +224,7 @@ def _flush_output(exit_code: int) -> int:
     try:
         sys.stdout.flush()
     except OSError as error:
-        _abandon_output()
+        _discard_output()
         if exit_code == 0:  # with another exit code, px4fuse has already printed an error
             _print_error(f"standard output cannot be written ({error.strerror}).")
             return 2
@@ -232,13 +233,13 @@ def _flush_output(exit_code: int) -> int:
 
 def _redirect_closed_streams() -> None:
     """Redirect a closed standard stream (``>&-``) to the null device."""
-    for number, name in ((1, "stdout"), (2, "stderr")):
+    for descriptor, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
             null_device = os.open(os.devnull, os.O_WRONLY)
-            if null_device != number:
-                os.dup2(null_device, number)
+            if null_device != descriptor:
+                os.dup2(null_device, descriptor)
                 os.close(null_device)
-            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
+            setattr(sys, name, open(descriptor, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
 
 
 def _with_option_names(text: str, command: str | None) -> str:
@@ -259,22 +260,24 @@ def _print_error(text: str) -> None:
     click.echo(f"px4fuse: {to_one_line(text)}", err=True)
 
 
-def _interrupt(signal_number: int, _: object) -> None:
+def _raise_interrupt(signal_number: int, _: object) -> None:
     # a termination signal has the effect of Ctrl-C, so that temporary files are deleted
     raise KeyboardInterrupt(signal_number)
 
 
-def _interrupt_again(ignored: "sys.UnraisableHookArgs") -> None:
-    """Repeat a signal that arrived in a finaliser or callback, whose exceptions Python ignores."""
-    error = ignored.exc_value
+def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Raise a signal again if it arrived in a finaliser, whose exceptions Python ignores."""
+    error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
-        number = error.args[0] if error.args else signal.SIGINT
+        signal_number = error.args[0] if error.args else signal.SIGINT
         # after 0.1 s the finaliser has ended; a signal also ends a blocking call of the main thread
-        threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, number]).start()
+        threading.Timer(
+            0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
+        ).start()
     else:
-        sys.__unraisablehook__(ignored)
+        sys.__unraisablehook__(unraisable)
 
 
-def _abandon_output() -> None:
+def _discard_output() -> None:
     # discards the buffered output, so that Python prints no error at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

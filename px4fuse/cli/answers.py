@@ -13,7 +13,7 @@ from px4fuse.cli.outputs import write_new
 @click.argument("log", type=InputPath())
 @output_option("FILE.toml", "Answer form to write (TOML).  [default: LOG.answers.toml beside LOG]")
 def answers(log: Path, output: Path | None) -> None:
-    """Write the answer form of a student for a flight.
+    """Write an empty form for a student's diagnosis of a flight.
 
     The form contains questions on injected faults, the behaviour of EKF2, and three numbers.
     Complete the form and give it to px4fuse compare --answers.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 # Maximum RPE delta (m, s or frames)
-MAX_DELTA = 1e6
+MAX_RPE_DELTA = 1e6
 # Options that are passed to px4fuse.trajectory.evaluation.evaluate as arguments
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
@@ -27,7 +27,7 @@ def parse_delta(text: str) -> Delta:
     from px4fuse.trajectory.scores import Delta
 
     match = _DELTA.fullmatch(text.strip())
-    if match is None or not 0.0 < float(match[1]) <= MAX_DELTA:
+    if match is None or not 0.0 < float(match[1]) <= MAX_RPE_DELTA:
         raise click.BadParameter(
             f"The delta {text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
         )

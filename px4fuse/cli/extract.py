@@ -60,7 +60,7 @@ def extract(
     from px4fuse.info import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = extraction.with_best_source(read_flight(comparison_request(log, option_values)))
+    flight = extraction.with_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet_bytes if format == "parquet" else _csv_bytes
@@ -72,7 +72,7 @@ def extract(
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
-    for missing_part in extraction.unavailable_parts(flight):
+    for missing_part in extraction.list_missing_data(flight):
         click.echo(f"Not exported: {missing_part.what} ({missing_part.reason})")
 
 

@@ -205,14 +205,16 @@ def grade(
     except KeyboardInterrupt as interrupt:
         message = f"results of verified reports are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
-    write_and_print({}, _page(outcome), written_files=outcome.written_paths)
+    write_and_print({}, _grading_page(outcome), written_files=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
     resolved_path = output.resolve()
-    parents = [folder for folder in (resolved_path, *resolved_path.parents) if folder.is_dir()]
+    output_folders = [
+        folder for folder in (resolved_path, *resolved_path.parents) if folder.is_dir()
+    ]
     for path in input_paths:
-        if path.is_dir() and any(map(path.samefile, parents)):
+        if path.is_dir() and any(map(path.samefile, output_folders)):
             raise OutputError(
                 f"-o {output} is inside the input {path}, so the next run would read this output. "
                 "Choose another output folder."
@@ -222,7 +224,7 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
     check_output_folder(output)
 
 
-def _page(outcome: GradeOutcome) -> Page:
+def _grading_page(outcome: GradeOutcome) -> Page:
     from collections import Counter
 
     from px4fuse.core.text import one_line

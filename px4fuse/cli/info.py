@@ -54,7 +54,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     not possible, and settings to log the missing data on the next flight.
     """
     from px4fuse.diagnose import read_flight
-    from px4fuse.info.inventory import take_inventory, to_plain
+    from px4fuse.info.inventory import take_inventory, to_json_dict
 
     request = comparison_request(log, option_values)
     check_targets([json_path])
@@ -62,11 +62,11 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
         flight = read_flight(request, show_progress)
         show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
-    contents = result_files(to_plain(inventory), json_path)
-    write_and_print(contents, _page(inventory, request))
+    contents = result_files(to_json_dict(inventory), json_path)
+    write_and_print(contents, _inventory_page(inventory, request))
 
 
-def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
+def _inventory_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
     from px4fuse.request import command_line

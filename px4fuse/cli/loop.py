@@ -43,13 +43,17 @@ def _parse_numbers(text: str, syntax: str, max_absolute: float) -> list[float]:
 def parse_landing(text: str) -> Landing:
     """Parse a landing place: ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
     return Landing(
-        *_parse_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M)
+        *_parse_numbers(
+            text, "FORWARD,RIGHT (two distances in m) or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M
+        )
     )
 
 
 def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
-    return GivenClosure(*_parse_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
+    return GivenClosure(
+        *_parse_numbers(text, "T1,T2 (two times in s) or T1,T2,SIGMA (σ in m)", sys.float_info.max)
+    )
 
 
 @click.command()
@@ -162,13 +166,13 @@ def loop(
     (g2o), which is optimised. LOG:vio, LOG:ekf2 or LOG:kf selects the track of a log; the default
     is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.core.reading import split_part
+    from px4fuse.core.reading import split_path_and_part
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    log = split_part(str(source))[0]  # without the name of the track
+    log = split_path_and_part(str(source))[0]  # without the name of the track
     student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
@@ -226,13 +230,13 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.core.reading import split_part
+    from px4fuse.core.reading import split_path_and_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
-    path, track = split_part(str(source))
+    path, track = split_path_and_part(str(source))
     if track is not None:
         raise SettingsError(
             f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."

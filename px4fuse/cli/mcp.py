@@ -17,13 +17,18 @@ from typing import Any, get_args
 import click
 
 from px4fuse.cli import TERMINATION_SIGNALS, cli, find_command, help_text, options, outputs
-from px4fuse.core.reading import check_readable, max_log_bytes, readable_folders, split_part
+from px4fuse.core.reading import (
+    check_readable,
+    max_log_bytes,
+    readable_folders,
+    split_path_and_part,
+)
 from px4fuse.errors import SettingsError
 
 # Name of the argument of a tool, by the name of the command's parameter if the names differ
 ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
 # Parameters of commands that tools do not have: outputs, exit codes and student
-HIDDEN = {
+HIDDEN_PARAMETERS = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
 }
@@ -131,7 +136,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
     from px4fuse.results import contract
 
     # command and type of the results by name of the tool
-    kinds: dict[str, tuple[str, type | UnionType | None]] = {
+    command_and_type_by_tool: dict[str, tuple[str, type | UnionType | None]] = {
         "info": ("info", dict),
         "diagnose": ("compare", Card),
         "what_if": ("whatif", contract.WhatIfResults),
@@ -143,11 +148,11 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
         "list_findings": ("explain", None),
     }
     tools = []
-    for name, (command_name, kind) in kinds.items():
+    for name, (command_name, result_type) in command_and_type_by_tool.items():
         parameters = {} if name == "list_findings" else _parameters_of(command_name)
         output_schema = None
-        if kind is not None:
-            schemas, definitions = contract.schema_of_types(get_args(kind) or (kind,))
+        if result_type is not None:
+            schemas, definitions = contract.schema_of_types(get_args(result_type) or (result_type,))
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
         tool = Tool(
             name=name,
@@ -155,34 +160,42 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
             input_schema=_input_schema(parameters),
             output_schema=output_schema,
         )
-        tools.append((tool, partial(_parse, command_name, parameters, folders)))
+        tools.append((tool, partial(_parse_arguments, command_name, parameters, folders)))
     return tools
 
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
     """Return the parameters of a command that are arguments of its tool, by argument name."""
     command = find_command(command_name)
-    names = {str(one.name): one for one in command.params if one.expose_value}
-    return {ARGUMENT_NAMES.get(name, name): names[name] for name in names if name not in HIDDEN}
+    parameter_by_name = {
+        str(parameter.name): parameter for parameter in command.params if parameter.expose_value
+    }
+    return {
+        ARGUMENT_NAMES.get(name, name): parameter_by_name[name]
+        for name in parameter_by_name
+        if name not in HIDDEN_PARAMETERS
+    }
 
 
 def _input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
-    operands = [name for name, one in parameters.items() if isinstance(one, click.Argument)]
+    argument_names = [
+        name for name, parameter in parameters.items() if isinstance(parameter, click.Argument)
+    ]
     return {
         "type": "object",
-        "properties": {name: _schema_of(one) for name, one in parameters.items()},
-        "required": operands,
+        "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
+        "required": argument_names,
         "additionalProperties": False,
     }
 
 
 def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
-    kind, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
-    if isinstance(kind, click.Choice):
-        schema = {"enum": [*kind.choices]}
-    elif isinstance(kind, options.TypedQuantity):
-        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + kind.auto]}
-    elif isinstance(kind, click.IntRange):
+    value_type, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
+    if isinstance(value_type, click.Choice):
+        schema = {"enum": [*value_type.choices]}
+    elif isinstance(value_type, options.TypedQuantity):
+        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + value_type.auto]}
+    elif isinstance(value_type, click.IntRange):
         schema = {"type": "integer"}
     elif getattr(parameter, "is_flag", False):
         schema = {"type": "boolean"}
@@ -193,7 +206,7 @@ def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
     return schema | {"description": getattr(parameter, "help", None) or ""}
 
 
-def _parse(
+def _parse_arguments(
     command_name: str,
     parameters: Mapping[str, click.Parameter],
     folders: Sequence[Path],
@@ -216,7 +229,7 @@ def _parse(
         texts = [str(text) for text in (value if isinstance(value, list) else [value])]
         if isinstance(parameter.type, options.InputPath):
             texts = [_find_file(texts[0], folders)]
-            files.append(split_part(texts[0])[0])
+            files.append(split_path_and_part(texts[0])[0])
         if isinstance(parameter, click.Argument):
             operands += texts
         elif isinstance(value, bool):
@@ -226,7 +239,7 @@ def _parse(
     return words + operands, files
 
 
-def _find_file(text: str, folders: Sequence[Path]) -> str:
+def _find_file(file_text: str, folders: Sequence[Path]) -> str:
     """Return the absolute path of ``FILE`` or ``FILE:PART`` in the first folder that contains it.
 
     Raises
@@ -234,7 +247,7 @@ def _find_file(text: str, folders: Sequence[Path]) -> str:
     LogError
         The file is outside the folders.
     """
-    paths = [str(folder / text) for folder in folders]
-    path = next((path for path in paths if split_part(path)[0].exists()), paths[0])
-    check_readable(split_part(path)[0], folders)
+    paths = [str(folder / file_text) for folder in folders]
+    path = next((path for path in paths if split_path_and_part(path)[0].exists()), paths[0])
+    check_readable(split_path_and_part(path)[0], folders)
     return path

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import click
 
 from px4fuse.core.input_files import check_outputs
-from px4fuse.core.writing import STANDARD_OUTPUT, write_all, written_before
+from px4fuse.core.writing import STANDARD_OUTPUT, format_written_outputs, write_all
 from px4fuse.errors import OutputError, ResultsError, to_one_line
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name: file systems allow 255. A longer name is cut to
-# KEPT_STEM_BYTES
+# Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
+# longer name is cut
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id of the student in a report without a student
 NO_STUDENT_NAME = ("", "")
@@ -39,9 +39,10 @@ UNWRAPPED_WIDTH = 10_000
 WRITTEN_KEY = "px4fuse.written"
 # Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
-# Keys in the context of click that px4fuse mcp sets: function that sends the activity of a run, and
-# list to which the results (JSON text) are added instead of being printed
-SEND_KEY, RESULTS_KEY = "px4fuse.send", "px4fuse.results"
+# Key in the context of click for the function that sends the activity of a run to px4fuse mcp
+SEND_KEY = "px4fuse.send"
+# Key in the context of click for the list of results (JSON text) that px4fuse mcp returns
+RESULTS_KEY = "px4fuse.results"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 # HTML element that contains the command and the SHA-256 of the log of a web page
@@ -124,7 +125,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
-    fault = "it is not a report on the same input files and student by this version of px4fuse"
+    fault = "the file is not a report of this px4fuse version on the same input files and student"
     _check_default(path, fault, partial(_is_same_report, results, read_attached_results))
     json_path = path.with_suffix(".json")
     _check_default(json_path, fault, partial(_is_same_report, results, read_results))
@@ -140,7 +141,7 @@ def check_default_page(path: Path, page: str) -> None:
         A file with this path exists and is not a web page of the same command and log.
     """
     generator = GENERATOR.findall(page)
-    fault = "it is not a web page of the same command and log by this version of px4fuse"
+    fault = "the file is not a page of this px4fuse version with the same command and log"
     _check_default(path, fault, lambda content: GENERATOR.findall(content.decode()) == generator)
 
 
@@ -162,9 +163,9 @@ def _is_same_report(
     """Return True if an existing report is on the same input files, and not of another student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
-    existing = read(content, "report")
-    same_files = file_hashes_in(to_json(existing)) == file_hashes_in(to_json(results))
-    return same_files and _student_name_and_id(existing) in (
+    existing_results = read(content, "report")
+    same_files = file_hashes_in(to_json(existing_results)) == file_hashes_in(to_json(results))
+    return same_files and _student_name_and_id(existing_results) in (
         NO_STUDENT_NAME,
         _student_name_and_id(results),
     )
@@ -223,18 +224,18 @@ def result_files(
     """
     from px4fuse.results.contract import to_json
 
-    text, contents = to_json(results), dict[Path, bytes]()
-    if (recorded := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
-        recorded.append(text)
+    json_text, contents = to_json(results), dict[Path, bytes]()
+    if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
+        recorded_texts.append(json_text)
         json_path = None if json_path == STANDARD_OUTPUT else json_path
     if output is not None and analysis is not None:
         from px4fuse.report.pdf import render
 
         show_progress("writing the report")
         output, results_path = report_paths(output, json_path)
-        contents |= {output: render(analysis, results, text), results_path: text.encode()}
+        contents |= {output: render(analysis, results, json_text), results_path: json_text.encode()}
     if json_path is not None:
-        contents[json_path] = text.encode()
+        contents[json_path] = json_text.encode()
     return contents
 
 
@@ -253,7 +254,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 def written_so_far(context: click.Context) -> str:
     written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
-    return f"{written_before(written_files)}." if written_files else "nothing was written."
+    return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:

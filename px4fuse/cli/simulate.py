@@ -77,7 +77,7 @@ def _scenario_options(command: Command) -> Command:
     return command
 
 
-class WithMistakes(click.Command):
+class CommandWithFaultTable(click.Command):
     """Command of click whose help ends with the table of injected faults."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -93,7 +93,7 @@ class WithMistakes(click.Command):
             )
 
 
-@click.command(cls=WithMistakes)
+@click.command(cls=CommandWithFaultTable)
 @output_option(
     "FLIGHT.ulg|DIR",
     "Log to write (ULog); with --assignment, the folder for the logs of the class.",
@@ -216,7 +216,7 @@ def simulate(
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
-    write_and_print(contents, _page(simulation, answer))
+    write_and_print(contents, _simulation_page(simulation, answer))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -308,7 +308,7 @@ def _write_assignment(
     write_and_print({}, page)
 
 
-def _page(simulation: Simulation, answer: Path | None) -> Page:
+def _simulation_page(simulation: Simulation, answer: Path | None) -> Page:
     from px4fuse.report.page import Page
 
     scenario, page = simulation.scenario, Page()

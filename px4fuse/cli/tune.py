@@ -52,19 +52,20 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     with progress(json_path) as show_progress:
         comparison = prepare_comparison(request, show_progress)
         tunings = tuned_noises(comparison, progress=show_progress)
-    missing_axes = [
+    missing_estimates = [
         noise_result for noise_result in tunings.values() if isinstance(noise_result, Unavailable)
     ]
-    if len(missing_axes) == len(tunings):
-        name, reason = comparison.flight.log.name, missing_axes[0].reason
+    if len(missing_estimates) == len(tunings):
+        name, reason = comparison.flight.log.name, missing_estimates[0].reason
         raise MissingDataError(
-            f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}", missing_axes[0].remedy
+            f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}",
+            missing_estimates[0].remedy,
         )
     results = tuning_results(request, comparison, tunings)
-    write_and_print(result_files(results, json_path), _page(comparison, tunings), request)
+    write_and_print(result_files(results, json_path), _tuning_page(comparison, tunings), request)
 
 
-def _page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
+def _tuning_page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
     from px4fuse.report.style import MUTED_COLOUR

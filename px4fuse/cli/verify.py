@@ -44,7 +44,7 @@ def verify(
 
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
-    from px4fuse.core.workers import JobFailure, run_one_bounded
+    from px4fuse.core.workers import JobFailure, run_one_with_limits
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
@@ -59,14 +59,14 @@ def verify(
         if logs and not files:
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
-        verdict = run_one_bounded(
+        verdict = run_one_with_limits(
             partial(verify_report, pdf=content, logs=files), recorded_results, TIMEOUT_S
         )
     if isinstance(verdict, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
     report_files = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
     contents = report_files | result_files(_verdict_data(content, verdict), json_path)
-    write_and_print(contents, _page(display_name(report), verdict, output))
+    write_and_print(contents, _verification_page(display_name(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
@@ -85,7 +85,7 @@ def _verdict_data(pdf: bytes, verdict: Verification) -> dict[str, object]:
     }
 
 
-def _page(name: str, verdict: Verification, output: Path | None) -> Page:
+def _verification_page(name: str, verdict: Verification, output: Path | None) -> Page:
     from px4fuse.core.text import one_line
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS

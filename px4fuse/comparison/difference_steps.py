@@ -240,14 +240,16 @@ def _step_reasons(
         samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != inputs.received.source:
         samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
-    age_ms = 1e3 * (source.age_s - kf_settings.clock_offset_s)
+    age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
         ends_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
-        ml_delay_ms, low_ms, high_ms = (1e3 * (source.age_s - offset_s) for offset_s in ends_s)
+        ml_delay_ms, low_ms, high_ms = (
+            1e3 * (source.assumed_delay_s - offset_s) for offset_s in ends_s
+        )
         delay_text += (
             f". The maximum-likelihood estimate of this delay is {ml_delay_ms:.0f} ms (95 % "
             f"{low_ms:.0f} to {high_ms:.0f} ms)"

@@ -32,7 +32,7 @@ from px4fuse.filter.time_offset import (
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
@@ -139,7 +139,7 @@ def tuned(
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
     if flight.log.is_assessed:
-        return {HORIZONTAL: WITHHELD}
+        return {HORIZONTAL: DIAGNOSIS_WITHHELD}
     return tune(
         comparison.lines,
         comparison.settings,
@@ -163,7 +163,7 @@ def estimate_noises_and_clock(
     signal_cache: SignalCache = {}  # both estimates use the same IMU signals
     tuning = tuned(comparison, names, progress, signal_cache)
     if comparison.flight.log.is_assessed:
-        return tuning, WITHHELD
+        return tuning, DIAGNOSIS_WITHHELD
     if slow_imu := missing_imu_rate(comparison.flight):
         return tuning, slow_imu
     settings, axis_tuning = comparison.settings, first_axis_tuning(tuning, HORIZONTAL, *tuning)

@@ -16,7 +16,7 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
-    HEIGHT_ONLY,
+    HEIGHT_ONLY_REASON,
     Columns,
     Ekf2,
     Flight,
@@ -30,15 +30,15 @@ from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
-    fused_aid,
+    has_fused_aid,
     with_gnss_innovations,
 )
-from px4fuse.readers.px4_topics import TOPIC_ORIGINS
+from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
-LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
+LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {source.name: source.origin for source in POSITION_INPUTS}
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -202,7 +202,7 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
     EKF2 then estimates the constant offset of vision, so KF must not see it as a position error.
     """
     ekf2 = flight.ekf2
-    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and fused_aid(ekf2)):
+    if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
         return track
     samples = track.samples.copy()
     offset_m = [
@@ -232,7 +232,9 @@ def _use_barometer_height(
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
-    is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
+    is_fused_by_ekf2 = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
+        ekf2, GNSS.vertical
+    )
     uses_barometer = height_name == "barometer" or (
         height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )
@@ -276,9 +278,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"or {remedy}"
         )
     reason = f"{damage_text}no external position in this log (no {topics})"
-    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY), None)
+    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
     if height_only is not None:
-        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY}"
+        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
     gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"
@@ -297,7 +299,7 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].preference < track.origin.preference
+        and LOGGED_ORIGINS[missing.source].preference_rank < track.origin.preference_rank
     ]
     if not better_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"

@@ -115,7 +115,7 @@ def wrong_delay_ms(
     comparison: Comparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
-    ml_delay_ms = 1e3 * (comparison.source.age_s - clock_offset.offset_s)
+    ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
     return (
         ml_delay_ms if clock_offset.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
     )
@@ -144,7 +144,7 @@ def delay_ms(comparison: Comparison) -> float | None:
     parameter_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
     return (
         None
-        if source.origin.fused_as_gnss and source.age_s == 0.0 != parameter_ms
+        if source.origin.fused_as_gnss and source.assumed_delay_s == 0.0 != parameter_ms
         else parameter_ms
     )
 

@@ -18,6 +18,6 @@ def median_interval(time_s: Array) -> float:
 def cumulative_integral(values: Array, time_s: Array) -> Array:
     """Integrate values over time up to each sample (trapezoidal rule, first axis, from zero)."""
     integral = np.zeros_like(values)
-    length = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
-    np.cumsum((values[1:] + values[:-1]) / 2.0 * length, axis=0, out=integral[1:])
+    intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
+    np.cumsum((values[1:] + values[:-1]) / 2.0 * intervals_s, axis=0, out=integral[1:])
     return integral

@@ -15,25 +15,25 @@ from pathlib import Path
 from px4fuse.errors import OutputError
 
 # Device and inode of a file or folder; its path on a file system without inodes
-_Identity = tuple[int, int] | str
+_FileIdentity = tuple[int, int] | str
 
 
 @dataclass(frozen=True)
-class _Register:
+class _InputRegister:
     """Input files and folders of a command that is running."""
 
-    inputs: set[_Identity] = field(default_factory=set)
-    input_by_folder: dict[_Identity, Path] = field(default_factory=dict)
+    inputs: set[_FileIdentity] = field(default_factory=set)
+    input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
     registered_folders: set[Path] = field(default_factory=set)
 
 
-_register: ContextVar[_Register | None] = ContextVar("register", default=None)
+_register: ContextVar[_InputRegister | None] = ContextVar("register", default=None)
 
 
 @contextmanager
 def inputs_protected() -> Iterator[None]:
     """Register all files that are read inside the context, and reject writing to them."""
-    token = _register.set(_Register())
+    token = _register.set(_InputRegister())
     try:
         yield
     finally:
@@ -53,21 +53,21 @@ def inputs_not_registered() -> Iterator[None]:
 def add_input(path: Path) -> None:
     """Register an input file or folder that exists."""
     register = _register.get()
-    if register is None or (identity := _identity(path)) is None:
+    if register is None or (identity := _file_identity(path)) is None:
         return
     register.inputs.add(identity)
     for folder in {path.absolute().parent, path.resolve().parent} - register.registered_folders:
         register.registered_folders.add(folder)
-        for parent in map(_identity, (folder, *folder.parents)):
+        for parent in map(_file_identity, (folder, *folder.parents)):
             if parent is not None:
                 register.input_by_folder.setdefault(parent, path)
 
 
 def check_outputs(targets: Iterable[Path]) -> None:
     """Raise an OutputError if an output is a registered input file or folder."""
-    register = _register.get() or _Register()
+    register = _register.get() or _InputRegister()
     for target in targets:
-        if _identity(target) in register.inputs:
+        if _file_identity(target) in register.inputs:
             raise OutputError(
                 f"{target} is an input of this command and was not overwritten. Choose "
                 "another output name."
@@ -78,10 +78,14 @@ def check_output_folder(folder: Path) -> None:
     """Raise an OutputError if the output folder is a file, or contains an input of the command."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
-    register = _register.get() or _Register()
-    entries = _entries(folder)
-    for path in (folder, *entries, *(child for entry in entries for child in _entries(entry))):
-        if (identity := _identity(path)) is None:
+    register = _register.get() or _InputRegister()
+    entries = _folder_entries(folder)
+    for path in (
+        folder,
+        *entries,
+        *(child for entry in entries for child in _folder_entries(entry)),
+    ):
+        if (identity := _file_identity(path)) is None:
             continue
         input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
         if input_path is not None:
@@ -91,11 +95,11 @@ def check_output_folder(folder: Path) -> None:
             )
 
 
-def _entries(folder: Path) -> list[Path]:
+def _folder_entries(folder: Path) -> list[Path]:
     return list(folder.iterdir()) if folder.is_dir() else []
 
 
-def _identity(path: Path) -> _Identity | None:
+def _file_identity(path: Path) -> _FileIdentity | None:
     with suppress(OSError, ValueError):  # ValueError: a path that contains NUL
         status = path.stat()
         if status.st_ino:

@@ -24,8 +24,8 @@ def one_line_repr(result: Any) -> str:
     >>> one_line_repr(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
     "Truth(name='mocap', samples=<2 × 1>)"
     """
-    names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
-    values = ((name, getattr(result, name)) for name in names)
+    field_names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
+    values = ((name, getattr(result, name)) for name in field_names)
     field_texts = ", ".join(
         f"{name}={_format_value(value)}"
         for name, value in values

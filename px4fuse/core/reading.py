@@ -27,7 +27,7 @@ else:
 
 #: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-#: Folders from which files may be read, which ``px4fuse mcp`` sets; empty: all folders
+#: Folders from which ``px4fuse mcp`` may read files; all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
 LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
 
@@ -41,7 +41,7 @@ def display_name(path: Path) -> str:
     return to_one_line(path.name or str(path))
 
 
-def split_part(argument: str) -> tuple[Path, str | None]:
+def split_path_and_part(argument: str) -> tuple[Path, str | None]:
     """Split ``FILE:PART``: a track of a log, a rigid body of a table, or a topic of a ROS bag."""
     path, colon, part = argument.rpartition(":")
     if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
@@ -81,7 +81,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
                 suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
-        raise _unreadable(name, error, error_type, suggestion) from error
+        raise _read_error(name, error, error_type, suggestion) from error
     if stat.S_ISDIR(status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
@@ -90,10 +90,10 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     return status.st_size
 
 
-def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
-    """Read at most ``count`` first bytes of a regular file."""
+def read_head(path: Path, byte_count: int, error_type: type[Px4FuseError]) -> bytes:
+    """Read at most ``byte_count`` first bytes of a regular file."""
     file_size(path, error_type)
-    return _read(path, count, error_type, display_name(path))
+    return _read_bytes(path, byte_count, error_type, display_name(path))
 
 
 def read_bytes_limited(
@@ -116,12 +116,14 @@ def read_bytes_limited(
         The file cannot be read, is too large or empty; of type ``error_type``.
     """
     name = name or display_name(path)
-    size = file_size(path, error_type, name)
-    content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
-    if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
-        content = _read(path, limit_bytes + 1, error_type, name)
-    if (actual_size := max(size, len(content))) > limit_bytes:
-        raise error_type(format_size_limit(name, actual_size, limit_bytes), size_remedy)
+    size_bytes = file_size(path, error_type, name)
+    content = (
+        b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
+    )
+    if len(content) > size_bytes:  # the file grows, or is in /proc, in which all sizes are 0
+        content = _read_bytes(path, limit_bytes + 1, error_type, name)
+    if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
+        raise error_type(format_size_limit(name, actual_size_bytes, limit_bytes), size_remedy)
     if empty_remedy is not None and not content:
         raise error_type(f"{name}: the file is empty", empty_remedy)
     return content
@@ -135,9 +137,9 @@ def read_log_bytes(path: Path) -> bytes:
     LogError
         The log cannot be read, is not a regular file, is empty or too large.
     """
-    limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again."
+    limit_bytes, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again."
     return read_bytes_limited(
-        path, LogError, limit, size_remedy=LOG_SIZE_REMEDY, empty_remedy=empty_remedy
+        path, LogError, limit_bytes, size_remedy=LOG_SIZE_REMEDY, empty_remedy=empty_remedy
     )
 
 
@@ -177,14 +179,18 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
         A path is not a regular file or a folder, or the file is too large or cannot be read.
     """
     file_by_hash: dict[str, Path] = {}
-    limit = max_log_bytes.get()
+    limit_bytes = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
             files = [
-                f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
+                f
+                for f in files_below(path)
+                if f.is_file() and file_size(f, LogError) <= limit_bytes
             ]
-        elif (size := file_size(path, LogError)) > limit:
-            raise LogError(format_size_limit(display_name(path), size, limit), LOG_SIZE_REMEDY)
+        elif (size_bytes := file_size(path, LogError)) > limit_bytes:
+            raise LogError(
+                format_size_limit(display_name(path), size_bytes, limit_bytes), LOG_SIZE_REMEDY
+            )
         else:
             files = [path]
         for file in files:
@@ -192,7 +198,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 with file.open("rb") as stream:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             except OSError as error:
-                raise _unreadable(display_name(file), error, LogError) from error
+                raise _read_error(display_name(file), error, LogError) from error
             file_by_hash.setdefault(sha256, file)
     return file_by_hash
 
@@ -204,43 +210,46 @@ def files_below(folder: Path) -> list[Path]:
     its reading raises the error.
     """
     files: list[Path] = []
-    open_folders = [folder]
-    while open_folders:
-        folder_path = open_folders.pop()
+    pending_folders = [folder]
+    while pending_folders:
+        folder_path = pending_folders.pop()
         try:
             with os.scandir(folder_path) as entries:
                 for entry in entries:
-                    paths = open_folders if entry.is_dir(follow_symlinks=False) else files
-                    paths.append(Path(entry.path))
+                    targets = pending_folders if entry.is_dir(follow_symlinks=False) else files
+                    targets.append(Path(entry.path))
         except OSError:
             files.append(folder_path)
     return sorted(files)
 
 
-def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:
+def _read_bytes(path: Path, byte_count: int, error_type: type[Px4FuseError], name: str) -> bytes:
     try:
-        with _open(path) as file:
-            content: bytes = file.read(count)
+        with _open_decompressed(path) as file:
+            content: bytes = file.read(byte_count)
             return content
     except (OSError, EOFError, zlib.error, zstd.ZstdError) as error:
-        raise _unreadable(name, error, error_type) from error
+        raise _read_error(name, error, error_type) from error
 
 
-def _open(path: Path) -> Any:
-    """Open a file; the content of a file that gzip or zstd compressed is read decompressed."""
+def _open_decompressed(path: Path) -> Any:
+    """Open a file; if gzip or zstd compressed it, its decompressed content is read."""
     with path.open("rb") as file:
         library = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
     return library.open(path) if library else path.open("rb")
 
 
-def _unreadable(
+def _read_error(
     name: str, error: Exception, error_type: type[Px4FuseError], remedy: str = ""
 ) -> Px4FuseError:
     reason = getattr(error, "strerror", None) or error
     return error_type(f"{name}: the file cannot be read ({reason}).", remedy)
 
 
-def format_size_limit(name: str, size: int, limit: int) -> str:
+def format_size_limit(name: str, size_bytes: int, limit_bytes: int) -> str:
     """Format the error of a file whose size (bytes) exceeds the limit (bytes)."""
-    size_mb, limit_mb = (f"{n / 1e6:,.{0 if n >= 10_000_000 else 2}f}" for n in (size, limit))
+    size_mb, limit_mb = (
+        f"{byte_count / 1e6:,.{0 if byte_count >= 10_000_000 else 2}f}"
+        for byte_count in (size_bytes, limit_bytes)
+    )
     return f"{name}: the file has {size_mb} MB, more than the limit of {limit_mb} MB"

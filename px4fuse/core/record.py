@@ -126,7 +126,7 @@ def to_serializable(value: Any) -> Any:
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
-def table(module_file: str, name: str, kind: type[T]) -> T:
+def read_toml(module_file: str, name: str, kind: type[T]) -> T:
     """Read a TOML file of px4fuse as the type ``kind``.
 
     Parameters

@@ -4,7 +4,7 @@ import re
 import unicodedata
 
 FORMULA_STARTS = "=+-@"
-# Excel truncates cells after 32,767 characters
+# Maximum length (characters) of a table cell: Excel truncates cells after 32,767
 MAX_CELL_LENGTH = 32_000
 
 

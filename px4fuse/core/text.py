@@ -107,16 +107,16 @@ def format_p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p {format_number(p, 2)}"
 
 
-def format_length(metres: float) -> str:
+def format_length(length_m: float) -> str:
     """Format a length (m) with its unit: mm, cm or m.
 
     >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
     ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
     """
-    for limit, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
-        if metres < limit:
-            return f"{metres * scale:.0f} {unit}"
-    return f"{metres:.{1 if metres < 9.95 else 0}f} m"
+    for limit_m, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
+        if length_m < limit_m:
+            return f"{length_m * scale:.0f} {unit}"
+    return f"{length_m:.{1 if length_m < 9.95 else 0}f} m"
 
 
 def format_ratio(ratio: float) -> str:
@@ -139,13 +139,13 @@ def format_metres(length_m: float) -> str:
     return f"{length_m:.{decimals}f}"
 
 
-def with_log_name(text: str, log: str) -> str:
+def with_log_name(text: str, log_name: str) -> str:
     """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
 
     >>> with_log_name("Check the time offset (px4fuse sync LOG).", "my log.ulg")
     "Check the time offset (px4fuse sync 'my log.ulg')."
     """
-    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log)}", text)
+    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log_name)}", text)
 
 
 def clean_text(text: str) -> str:
@@ -158,22 +158,24 @@ def clean_text(text: str) -> str:
     >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
     """
-    return text if text.isascii() and text.isprintable() else "".join(filter(_is_harmless, text))
+    return (
+        text if text.isascii() and text.isprintable() else "".join(filter(_is_safe_character, text))
+    )
 
 
-def one_line(text: str, length: int) -> str:
-    r"""Clean a text (see :func:`clean_text`) and shorten it to one line of ``length`` characters.
+def one_line(text: str, max_length: int) -> str:
+    r"""Clean a text (:func:`clean_text`) and shorten it to one line of ``max_length`` characters.
 
     >>> one_line("a\nb\t c", 4)
     'a b…'
     """
     # the text is cut first, because cleaning millions of characters would be slow
-    line = " ".join(clean_text(text[: 10 * length]).split())
-    return line if len(line) <= length else line[: length - 1].rstrip() + "…"
+    line = " ".join(clean_text(text[: 10 * max_length]).split())
+    return line if len(line) <= max_length else line[: max_length - 1].rstrip() + "…"
 
 
 @cache
-def _is_harmless(character: str) -> bool:
+def _is_safe_character(character: str) -> bool:
     code = ord(character)
     if character in "\n\t":
         return True

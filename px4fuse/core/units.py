@@ -4,12 +4,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 
-_UNITS = table(__file__, "units.toml", dict[str, dict[str, Any]])
-# Full names of the units by symbol, and factors that convert typed units to the units of px4fuse
+_UNITS = read_toml(__file__, "units.toml", dict[str, dict[str, Any]])
+# Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNITS["names"]
-_SCALES: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
+# Factors that convert typed units to a unit of px4fuse, by the unit of px4fuse
+_SCALES_BY_UNIT: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
@@ -22,7 +23,7 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     (0.1, 0.5, None)
     """
     match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
-    scale = _SCALES.get(unit, {}).get(match[2].lower() or unit.lower()) if match else None
+    scale = _SCALES_BY_UNIT.get(unit, {}).get(match[2].lower() or unit.lower()) if match else None
     if match is None or scale is None:
         return None
     try:

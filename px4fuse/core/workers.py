@@ -29,14 +29,14 @@ Result = TypeVar("Result")
 
 # Maximum number of jobs of a worker process, because caches of libraries grow; a lower number would
 # cost time, because the imports of a new process take 2 s
-JOBS_PER_WORKER = 80
+MAX_JOBS_PER_WORKER = 80
 # Default maximum time (s) and memory (bytes) of a job; a report of a 10-minute flight takes 60 s
 TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 # Maximum time (s) for the imports of a new process on a slow and busy computer
 START_TIMEOUT_S = 180.0
 # Environment variables of worker processes. PYTHONSAFEPATH prevents imports from the current
 # folder, by which a submitted functools.py would be executed
-_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
+_WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,9 @@ class JobFailure:
 class _Worker:
     """Worker process with its current job, and the pipe through which it is controlled."""
 
-    def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
+    def __init__(
+        self, function: Callable[[Any], Any], memory_bytes: int | None, job_index: int
+    ) -> None:
         # spawn works on all systems and does not copy the memory of the parent
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
@@ -57,7 +59,7 @@ class _Worker:
             target=_run_worker, args=(child_pipe, function, memory_bytes)
         )
         environment = dict(os.environ)
-        os.environ.update(_ENVIRONMENT)
+        os.environ.update(_WORKER_ENVIRONMENT)
         try:
             with _interrupts_blocked():
                 self.process.start()
@@ -66,8 +68,8 @@ class _Worker:
             os.environ.update(environment)
         child_pipe.close()  # only the worker process may keep this end of the pipe open
         self.is_ready = False
-        self.job = job
-        self.jobs_done = 0
+        self.job_index = job_index
+        self.finished_count = 0
         self.deadline = time.monotonic() + START_TIMEOUT_S
 
     def end(self) -> None:
@@ -91,7 +93,7 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def run_bounded(
+def run_with_limits(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
     *,
@@ -121,11 +123,11 @@ def run_bounded(
     (int, object)
         Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
     """
-    with closing(poll_bounded(function, jobs, processes, timeout_s, memory_bytes)) as outcomes:
+    with closing(poll_with_limits(function, jobs, processes, timeout_s, memory_bytes)) as outcomes:
         yield from (outcome for outcome in outcomes if outcome is not None)
 
 
-def poll_bounded(
+def poll_with_limits(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
     processes: int | None,
@@ -133,14 +135,14 @@ def poll_bounded(
     memory_bytes: int | None,
     max_wait_s: float = math.inf,
 ) -> Generator[tuple[int, Result | JobFailure] | None]:
-    """Run jobs as :func:`run_bounded` does; yield None if no job finishes within ``max_wait_s``."""
-    waiting_jobs = list(range(len(jobs)))[::-1]
+    """Run jobs as :func:`run_with_limits`; yield None if no job finishes within ``max_wait_s``."""
+    waiting_indices = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
-        while waiting_jobs or workers:
-            while waiting_jobs and len(workers) < (processes or os.cpu_count() or 1):
+        while waiting_indices or workers:
+            while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
                 # the job is assigned before the process starts, so that a failed start ends one job
-                new_worker = _Worker(function, memory_bytes, waiting_jobs.pop())
+                new_worker = _Worker(function, memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
             # the wait ends at the first deadline or if a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
@@ -154,33 +156,40 @@ def poll_bounded(
                     if is_usable and not worker.is_ready:
                         worker.is_ready = True
                     else:
-                        yield worker.job, result
-                        worker.jobs_done += 1
-                        if not is_usable or worker.jobs_done >= JOBS_PER_WORKER or not waiting_jobs:
+                        yield worker.job_index, result
+                        worker.finished_count += 1
+                        if (
+                            not is_usable
+                            or worker.finished_count >= MAX_JOBS_PER_WORKER
+                            or not waiting_indices
+                        ):
                             workers.pop(pipe).end()
                             continue
-                        worker.job = waiting_jobs.pop()
+                        worker.job_index = waiting_indices.pop()
                     worker.deadline = time.monotonic() + timeout_s
                     # the next read of the pipe detects that the worker process has died
                     with suppress(BrokenPipeError, ConnectionResetError):
-                        pipe.send(jobs[worker.job])
+                        pipe.send(jobs[worker.job_index])
                 elif time.monotonic() >= worker.deadline:
-                    limit = timeout_s if worker.is_ready else START_TIMEOUT_S
+                    limit_s = timeout_s if worker.is_ready else START_TIMEOUT_S
                     workers.pop(pipe).end()
-                    yield worker.job, JobFailure(f"the job exceeded the time limit of {limit:g} s.")
+                    yield (
+                        worker.job_index,
+                        JobFailure(f"the job exceeded the time limit of {limit_s:g} s."),
+                    )
     finally:
         for worker in workers.values():
             worker.end()
 
 
-def run_one_bounded(
+def run_one_with_limits(
     function: Callable[[Job], Result],
     job: Job,
     timeout_s: float,
     memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> Result | JobFailure:
-    """Call a function on one job in a worker process, with limits as in :func:`run_bounded`."""
-    results = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
+    """Call a function on one job in a worker process, with limits as in :func:`run_with_limits`."""
+    results = run_with_limits(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(results):
         return next(results)[1]
 
@@ -191,8 +200,10 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     except (EOFError, OSError):
         worker.process.join(5)
         phase = "a job" if worker.is_ready else "its start"
-        code = worker.process.exitcode
-        return False, JobFailure(f"the worker process ended during {phase} (exit code {code}).")
+        exit_code = worker.process.exitcode
+        return False, JobFailure(
+            f"the worker process ended during {phase} (exit code {exit_code})."
+        )
     # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
@@ -208,10 +219,10 @@ def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: 
     with suppress(EOFError, OSError):  # the parent process closed the pipe, or was killed
         pipe.send((True, None))
         while True:
-            pipe.send_bytes(_result_of(function, pipe.recv()))
+            pipe.send_bytes(_pickled_result(function, pipe.recv()))
 
 
-def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
+def _pickled_result(function: Callable[[Any], Any], job: Any) -> bytes:
     """Run a job in a worker process and pickle its result for :func:`_receive_result`."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)

@@ -15,16 +15,16 @@ from px4fuse.errors import OutputError
 
 STANDARD_OUTPUT = Path("-")
 # Maximum time (s) to wait for a program that reads a named pipe
-READER_TIMEOUT_S = 5.0
+PIPE_READER_TIMEOUT_S = 5.0
 # True on Windows, on which a file cannot be replaced while another program has it open
 LOCKS_OPEN_FILES = sys.platform == "win32"
 # Action if an output cannot be written, by error number
-REMEDIES = {
+REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
     errno.EROFS: "Choose a folder that can be written.",
 }
-# Maximum number of paths that a message lists; if there are more, it contains their number
-_MAX_LISTED = 4
+# Maximum number of output paths in a message; more paths are replaced by their number
+_MAX_LISTED_PATHS = 4
 
 
 def write_all(
@@ -47,7 +47,7 @@ def write_all(
     pipe_error = None
     for path, content in contents.items():
         try:
-            _write(path, content)
+            _write_output(path, content)
         except BrokenPipeError as error:  # the reader has ended (| head)
             pipe_error = error
             continue
@@ -59,23 +59,23 @@ def write_all(
         raise pipe_error
 
 
-def written_before(paths: Sequence[Path]) -> str:
+def format_written_outputs(paths: Sequence[Path]) -> str:
     """Format the list of the outputs that a run wrote before it ended early.
 
-    >>> written_before([Path("a.pdf"), Path("a.json")])
+    >>> format_written_outputs([Path("a.pdf"), Path("a.json")])
     'outputs already written: a.pdf, a.json'
     """
-    names = ", ".join(map(str, paths)) if len(paths) <= _MAX_LISTED else f"{len(paths)} files"
+    names = ", ".join(map(str, paths)) if len(paths) <= _MAX_LISTED_PATHS else f"{len(paths)} files"
     return f"outputs already written: {names}"
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write_output(path: Path, content: bytes) -> None:
     if path == STANDARD_OUTPUT or _is_standard_output(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
     elif stat.S_ISREG(mode := _file_mode(path)):
-        _replace(path.resolve(), content)
+        _replace_file(path.resolve(), content)
     else:
         with _open_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
             file.write(content)
@@ -96,24 +96,24 @@ def _file_mode(path: Path) -> int:
         return stat.S_IFREG
 
 
-def _replace(target: Path, content: bytes) -> None:
+def _replace_file(target: Path, content: bytes) -> None:
     is_new_folder = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
     # the temporary name is short, because the target's name may have the maximum length
-    temporary = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
+    temporary_path = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
-        with temporary.open("xb") as file:
+        with temporary_path.open("xb") as file:
             file.write(content)
-        temporary.replace(target)
+        temporary_path.replace(target)
     finally:
-        temporary.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
         if is_new_folder and not target.exists():  # for example on a full disk
             target.parent.rmdir()
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe after a wait of at most READER_TIMEOUT_S for a program that reads it."""
-    deadline = time.monotonic() + READER_TIMEOUT_S
+    """Open a named pipe after waiting at most PIPE_READER_TIMEOUT_S for a program that reads it."""
+    deadline = time.monotonic() + PIPE_READER_TIMEOUT_S
     while True:
         try:
             descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
@@ -129,8 +129,10 @@ def _open_pipe(path: Path) -> IO[bytes]:
 def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
     reason = "no program reads the pipe" if error.errno == errno.ENXIO else error.strerror
-    already_written = f"; {written_before(written_files)}" if written_files else ""
-    remedy = REMEDIES.get(error.errno or 0, "Choose another output name.")
+    faults = [f"{name} cannot be written ({reason})"]
+    if written_files:
+        faults.append(format_written_outputs(written_files))
+    remedy = REMEDY_BY_ERRNO.get(error.errno or 0, "Choose another output name.")
     if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
         remedy = "Close the program that has the file open, or choose another output name."
-    return OutputError(f"{name} cannot be written ({reason}){already_written}", remedy)
+    return OutputError("; ".join(faults), remedy)

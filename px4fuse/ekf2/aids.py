@@ -322,9 +322,11 @@ def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
 def _longest_gap(
     sample_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
 ) -> Span:
-    is_inside = (aid_log.unknown_fusion_s > start_s) & (aid_log.unknown_fusion_s < end_s)
+    is_inside = (aid_log.unknown_fusion_times_s > start_s) & (
+        aid_log.unknown_fusion_times_s < end_s
+    )
     gap_ends_s = np.union1d(
-        np.r_[start_s, sample_s[is_fused], end_s], aid_log.unknown_fusion_s[is_inside]
+        np.r_[start_s, sample_s[is_fused], end_s], aid_log.unknown_fusion_times_s[is_inside]
     )
     gap_starts_s = gap_ends_s[:-1]
     is_enabled = np.ones(len(gap_starts_s), bool)

@@ -48,7 +48,7 @@ def sample_interval_s(fusion_record: FusionRecord) -> float:
         low_s, median_s, high_s = np.percentile(intervals_s, [25.0, 50.0, 75.0])
         if high_s - low_s < MAX_INTERVAL_SCATTER * median_s:
             return float(median_s)
-    return 1.0 / (OLD_BAROMETER_HZ if fusion_record.per_step_biases else BAROMETER_HZ)
+    return 1.0 / (OLD_BAROMETER_HZ if fusion_record.stores_bias_increments else BAROMETER_HZ)
 
 
 def _bias_gain(bias: pd.DataFrame) -> Array:

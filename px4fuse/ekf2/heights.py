@@ -28,7 +28,7 @@ from px4fuse.ekf2.replay_segments import (
     sample_steps,
     samples_by_event,
 )
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
 # Indices of vertical velocity and height in the state
@@ -57,7 +57,7 @@ def add_heights(
     """Add height measurements to the segments, or return the reason why the log is insufficient."""
     parameters = fusion_record.parameters
     replayed_s = np.concatenate([segment.time_s for segment in segments])
-    if fuses_by_mask(parameters):
+    if uses_aid_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled_fractions = {
         name: np.mean(step_values_at(log.enabled, replayed_s) > 0.0)

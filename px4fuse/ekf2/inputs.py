@@ -34,7 +34,7 @@ from px4fuse.flight.ekf2_parameters import (
     MAG,
     Aid,
     effective_settings,
-    fuses_by_mask,
+    uses_aid_mask,
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
@@ -49,9 +49,9 @@ from px4fuse.flight.model import (
 )
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import flight_spans
-from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
+from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
-from px4fuse.readers.px4_topics import DEFAULT_PROFILE
+from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
@@ -242,7 +242,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         (*GNSS_LABELS, *([FLOW.label] if len(fusion_record.flow) else [])) if is_gnss else ()
     )
     if unmodelled_aids := [
-        label for label in fusion_record.other_aiding if label not in modelled_aids
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_aids
     ]:
         disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
         return Unavailable(
@@ -362,7 +362,7 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    min_bias_variance = 5e-8 / step_s**2 if fusion_record.per_step_biases else None
+    min_bias_variance = 5e-8 / step_s**2 if fusion_record.stores_bias_increments else None
     is_horizon_from_delay = "EKF2_DELAY_MAX" not in fusion_record.parameters
     if is_gnss:
         # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
@@ -383,7 +383,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
         )
     # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
-    if not fuses_by_mask(fusion_record.parameters):
+    if not uses_aid_mask(fusion_record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
     return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
 
@@ -393,7 +393,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
-    return GNSS_POS if fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
+    return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
@@ -417,7 +417,7 @@ def read_gnss(
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(
-            ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE
+            ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE_REMEDY
         )
     if track.rate_hz < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
@@ -444,7 +444,7 @@ def read_gnss(
         position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     )
     velocity = velocity_samples[Columns.VELOCITY].to_numpy()
-    fuses_velocity = fuses_by_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
+    fuses_velocity = uses_aid_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
     velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
     return ReceivedPositions(
@@ -456,7 +456,7 @@ def read_gnss(
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
-        uses_sender_times=track.age_s == 0.0 != logged_delay_s,
+        uses_sender_times=track.assumed_delay_s == 0.0 != logged_delay_s,
     )
 
 
@@ -477,7 +477,7 @@ def read_vision(
     is_rotated_by_ekf2 = (
         not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
     )
-    if fuses_by_mask(fusion_record.parameters):
+    if uses_aid_mask(fusion_record.parameters):
         is_rotated_by_ekf2 = bool(int(fusion_record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
@@ -522,7 +522,7 @@ def _read_vision_besides_gnss(
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
     if (enabled_log := _enabled_log(ekf2, EV_POS)) is None:
         return None
-    if fuses_by_mask(fusion_record.parameters):
+    if uses_aid_mask(fusion_record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
             f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "

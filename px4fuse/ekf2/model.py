@@ -55,7 +55,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
-    FIELD_NOISES,
+    FIELD_NOISE_PARAMETERS,
     FLOW,
     GNSS_POS,
     GNSS_VEL,
@@ -206,9 +206,16 @@ def replay_settings(
     height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
-            ((*MAG.own_parameters, *FIELD_NOISES), "the log lacks some fused magnetometer samples"),
             (
-                BAROMETER.own_parameters,
+                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
+                "the log lacks some fused magnetometer samples",
+            ),
+            (
+                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
+                "the log lacks some fused magnetometer samples",
+            ),
+            (
+                BAROMETER.measurement_parameters,
                 height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
             ),
         ):

@@ -13,7 +13,7 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.core.record import Record, table
+from px4fuse.core.record import Record, read_toml
 from px4fuse.explore.data import Data
 
 # Options of a drawing function of Bokeh
@@ -83,7 +83,7 @@ class Figures(Record, frozen=True):
     plots: dict[str, Plot]
 
 
-FIGURES = table(__file__, "figures.toml", Figures)
+FIGURES = read_toml(__file__, "figures.toml", Figures)
 
 
 def document_json(data: Data) -> tuple[Any, dict[str, str]]:

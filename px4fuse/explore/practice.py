@@ -16,7 +16,7 @@ from msgspec import structs
 
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
-from px4fuse.core.record import Record, table
+from px4fuse.core.record import Record, read_toml
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
@@ -88,7 +88,7 @@ class MistakeTable(Record, frozen=True):
     mistakes: tuple[HiddenMistake, ...]
 
 
-_TABLES = table(__file__, "practice.toml", MistakeTable)
+_TABLES = read_toml(__file__, "practice.toml", MistakeTable)
 FAULT_CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
 
 

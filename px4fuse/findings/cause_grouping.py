@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, group_by_root
 
@@ -41,7 +41,7 @@ ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
 # Ids of the effects of each finding, one per line
-CONSEQUENCES: Mapping[str, str] = table(__file__, "consequences.toml", dict[str, str])
+CONSEQUENCES: Mapping[str, str] = read_toml(__file__, "consequences.toml", dict[str, str])
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -22,7 +22,7 @@ from px4fuse.findings.model import (
     spans_with_value,
     warning,
 )
-from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
+from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_phrase
 from px4fuse.flight.position_source import POSITION_FILE
 
 # Fraction of the time in which EKF2 fuses the source, below which the severity is error
@@ -55,7 +55,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
         yield from _detect_slow_restart(analysis, ekf2, fusing)
     if source is None or fused_fraction >= MIN_FUSED_FRACTION_WARNING:
         return
-    positions, aid = positions_of(source), source.origin.aid
+    positions, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.rate_hz,
@@ -177,7 +177,7 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
         longest_s = max(end - start for start, end in late_spans)
         yield note(
             "source_rate_at_limit",
-            f"{positions_of(source)} come at {source.rate_hz:.1f} Hz, so EKF2 "
+            f"{positions_phrase(source)} come at {source.rate_hz:.1f} Hz, so EKF2 "
             f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
             f"fusion only if two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",

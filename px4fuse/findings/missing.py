@@ -4,7 +4,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import Unavailable, positions_of
+from px4fuse.flight.model import Unavailable, positions_phrase
 from px4fuse.flight.position_source import RECEIVED
 
 RECEIVED_TOPIC = "vehicle_visual_odometry"
@@ -45,8 +45,10 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: Comparison) -> Findings:
     """Detect a log without the positions as PX4 received them."""
-    source, preference = analysis.source, RECEIVED.preference
-    is_logged = any(track.origin.preference == preference for track in analysis.flight.positions)
+    source, received_rank = analysis.source, RECEIVED.preference_rank
+    is_logged = any(
+        track.origin.preference_rank == received_rank for track in analysis.flight.positions
+    )
     if source.origin.has_all_samples or is_logged:
         return
     rate_hz, parameters = source.rate_hz, analysis.flight.log.parameters
@@ -58,7 +60,7 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
     )
     yield warning(
         "source_not_logged",
-        f"The log lacks the {positions_of(source)} as PX4 received them. Reason: "
+        f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{RECEIVED_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
         f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} (bit 7) and fly again.",

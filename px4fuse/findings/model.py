@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.record import Record, Span, table
+from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
@@ -47,7 +47,7 @@ class CatalogueEntry(Record, frozen=True):
 
 
 # All findings by id; findings of equal severity are listed in this order
-CATALOGUE: Mapping[str, CatalogueEntry] = table(
+CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, "catalogue.toml", dict[str, CatalogueEntry]
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
@@ -93,7 +93,7 @@ class SourceWords(Record, frozen=True):
     errors: str
 
 
-_WORDS = table(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+_WORDS = read_toml(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
 SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
     kind: SourceWords(**(_WORDS["unknown"] | words)) for kind, words in _WORDS.items()
 }

@@ -41,7 +41,7 @@ from px4fuse.findings.model import Findings, error, finding, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
-from px4fuse.readers.px4_innovations import fused_aid
+from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Minimum factor between a noise setting and its estimate for a warning: a smaller factor hardly
@@ -338,7 +338,7 @@ def _format_excessive_noise(analysis: Analysis) -> str:
 def _noise_minimum(analysis: Analysis) -> str:
     parameters = analysis.flight.log.parameters
     gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
-    is_besides_gnss = analysis.source.origin.is_vision and fused_aid(analysis.flight.ekf2)
+    is_besides_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
     if not is_besides_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
         return ""
     return (

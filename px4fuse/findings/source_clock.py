@@ -11,7 +11,7 @@ from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
-from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
+from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
@@ -81,7 +81,7 @@ def _rmse_ratio(trial: Trial | None) -> float:
 
 def _receiver_delay(analysis: Analysis) -> str | None:
     parameters = analysis.flight.log.parameters
-    names = (name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters)
+    names = (name for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay) if name in parameters)
     return next(names, None) if analysis.source.origin.fused_as_gnss else None
 
 

@@ -22,7 +22,7 @@ from px4fuse.convention.texts import (
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
-from px4fuse.flight.model import PositionTrack, positions_of, source_name
+from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
 # Groups of findings that do not depend on the positions
 UNAFFECTED_GROUPS = ("logging", "IMU")
@@ -105,7 +105,7 @@ def _faults(analysis: Comparison) -> Faults:
 def _position_faults(
     convention: Convention, faults: Faults, source: PositionTrack
 ) -> Iterator[Fault]:
-    positions, alignment = positions_of(source), source.alignment
+    positions, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     basis_text = (

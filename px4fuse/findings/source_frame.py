@@ -12,7 +12,7 @@ from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_phrase, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
@@ -48,7 +48,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     fusing = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
     fault = (
-        f"{positions_of(analysis.source)} are in FRD: their x axis is the "
+        f"{positions_phrase(analysis.source)} are in FRD: their x axis is the "
         "heading at start, not north."
     )
     detail, action = "", f"In this report, north is the x axis of {name}."
@@ -88,7 +88,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     )
     if is_bias or abs(rotation_deg) < max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG):
         return
-    positions = positions_of(analysis.source)
+    positions = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so the heading is wrong."
@@ -178,7 +178,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {change:+.0f}° relative to the "
-        f"{positions_of(analysis.source)}. Its error is {angles[0]:+.0f}° from "
+        f"{positions_phrase(analysis.source)}. Its error is {angles[0]:+.0f}° from "
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, estimated from "
         f"{basis}). A constant rotation of the positions cannot correct this. Possible cause: "

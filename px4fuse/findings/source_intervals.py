@@ -16,7 +16,7 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, finding, format_percent, note, source_words, warning
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import Ekf2, Unavailable, positions_of, step_values_at
+from px4fuse.flight.model import Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.flight.position_source import ALIGNED
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
@@ -65,7 +65,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
                 yield _partial_source(analysis, span, aids)
         else:
             spans.append(span)
-    positions = positions_of(source)
+    positions = positions_phrase(source)
     if logged_spans:
         start_s, end_s, longest = _longest(logged_spans)
         yield warning(
@@ -122,7 +122,7 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     return finding(
         "error" if has_aids and not aids and duration_s > MAX_NOT_FUSED_S else "warning",
         "source_stops" if stops else "source_begins",
-        f"{positions_of(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
+        f"{positions_phrase(source)} {event} in flight at {at_s:.1f} s{effect_text}. "
         f"{aiding}KF, RMSE and verdicts do not include this time.",
         f"Check {source_words(source).reception} {before_or_after} {at_s:.1f} s.{action}",
         {"at_s": at_s, "duration_s": duration_s, **at_end},
@@ -224,7 +224,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
-            f"{positions_of(source)}. {lost_count} of {sent_count} positions are missing (one per "
+            f"{positions_phrase(source)}. "
+            f"{lost_count} of {sent_count} positions are missing (one per "
             f"{typical_s:.2f} s is expected). EKF2 may have received them.",
             action,
             {"lost": lost_count, "lost_fraction": lost_count / sent_count},
@@ -236,7 +237,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     source = analysis.source
     # mapped timestamps and a logger with a lower rate do not show the intervals of received
     # positions
-    if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
+    if source.clock_map is not None or source.origin.preference_rank >= ALIGNED.preference_rank:
         return
     intervals, _ = _intervals(analysis)
     base_and_multiples = _base_interval(intervals) if len(intervals) >= MIN_INTERVALS else None
@@ -256,7 +257,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     interval_s = float(np.mean(intervals))
     is_too_slow = interval_s > EV_START_INTERVAL_S
     message = (
-        f"{positions_of(source)} arrive at {1.0 / interval_s:.2g} Hz, "
+        f"{positions_phrase(source)} arrive at {1.0 / interval_s:.2g} Hz, "
         f"downsampled from {1.0 / base_s:.2g} Hz. The intervals are whole multiples of "
         f"{base_s:.3g} s, so {format_percent(lost_fraction)} of the positions are missing."
     )

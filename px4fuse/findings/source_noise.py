@@ -17,7 +17,7 @@ from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Findings, error, format_percent, note, source_words, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
-from px4fuse.flight.model import Columns, positions_of, source_name
+from px4fuse.flight.model import Columns, positions_phrase, source_name
 
 # Ratio of white to time-correlated noise above which white noise is a separate fault
 MIN_WHITE_FRACTION = 0.3
@@ -111,7 +111,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     make_finding = error if repeated_fraction >= MIN_REPEAT_FRACTION_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous "
+        f"{count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the previous "
         f"position ({format_percent(repeated_fraction)}). KF and EKF2 use each repetition as a new "
         "measurement.",
         "Send each position once, with its time of measurement.",

@@ -35,7 +35,7 @@ from px4fuse.flight.model import (
     Columns,
     Ekf2,
     Unavailable,
-    positions_of,
+    positions_phrase,
     reset_times_s,
     source_name,
     white_noise_m,
@@ -162,7 +162,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
         make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
         yield make_finding(
             "source_low_pass_filtered",
-            f"{positions_of(analysis.source)} are low-pass filtered and lag by "
+            f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
             f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
             "independent errors, so both are overconfident and lag.",
@@ -187,7 +187,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if large_jumps:
         largest = max(large_jumps, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
-        positions = positions_of(analysis.source)
+        positions = positions_phrase(analysis.source)
         words = source_words(analysis.source)
         cause = f"Possible causes: {words.jump}."
         evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
@@ -368,7 +368,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
         "source_outliers",
-        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} "
+        f"{count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
         f"{format_metres(float(np.median(sizes_m)))} m. "

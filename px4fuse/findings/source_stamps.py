@@ -8,8 +8,8 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP_ACTION, STAMP_FAULTS, SYNCHRONISE_ACTION
 from px4fuse.findings.model import Findings, error, fraction_on, note, warning
-from px4fuse.flight.log import SHARED_STAMPS, ClockMap
-from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
+from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
+from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_phrase
 
 # Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
@@ -35,10 +35,10 @@ ANSWER_TIMESYNC = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    clock, positions = analysis.source.clock_map, positions_of(analysis.source)
+    clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
-    elif clock.note == SHARED_STAMPS and clock.distinct_stamps:
+    elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
     elif clock.clock in STAMP_FAULTS:
         yield from detect_timestamp_unit(analysis, clock.clock)
@@ -76,7 +76,7 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
     rate_hz = count / (distinct_count * resolution_s)
     yield error(
         "source_timestamps_shared",
-        f"The timestamps of the {positions_of(analysis.source)} have a resolution of "
+        f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
         f"{resolution_s:.3g} s. {count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
         "timestamps. px4fuse uses the first sample of each timestamp. At 1 m/s a rounded "
         f"timestamp is a position error of up to {format_metres(resolution_s)} m.",
@@ -95,7 +95,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(
         "source_timestamp_unit",
-        f"The timestamps of the {positions_of(analysis.source)} are "
+        f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
         f"in microseconds since the autopilot's boot. {effect}px4fuse uses the arrival times, "
         "which are late by the latency.",

@@ -18,7 +18,7 @@ from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, source_words, warning
 from px4fuse.findings.source_intervals import state_errors_after
-from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_STEP_M = 0.05
@@ -92,7 +92,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
         longest_s = max(spans, key=lambda span: span[1] - span[0])
         duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
-        fault = fault_template.format(positions=f"{count} {positions_of(source)}")
+        fault = fault_template.format(positions=f"{count} {positions_phrase(source)}")
         times = f"{len(spans)} spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
@@ -134,8 +134,8 @@ def detect_rounding(analysis: Analysis) -> Findings:
         )
     yield warning(
         "source_positions_rounded",
-        f"{positions_of(source)} move in steps of {step_m:.3g} m. {cause} The rounding error is "
-        f"{step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. {NO_ESTIMATES}",
+        f"{positions_phrase(source)} move in steps of {step_m:.3g} m. {cause} The rounding error "
+        f"is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. {NO_ESTIMATES}",
         action,
         {"step_m": step_m},
     )
@@ -225,8 +225,8 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     )
     yield error(
         "source_two_senders",
-        f"Two systems alternately send positions that differ by {size_m:.2f} m. Every other one "
-        f"of the {positions_of(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. "
+        f"Two systems alternately send positions that differ by {size_m:.2f} m. Every other one of "
+        f"the {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. "
         f"{NO_ESTIMATES}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",

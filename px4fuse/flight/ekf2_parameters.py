@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.errors import SettingsError, suggest_name
 
 
@@ -26,7 +26,7 @@ class Aid:
     # Parameters for the measurement noise (σ) and the innovation gate (√S)
     noise: str = ""
     gate: str = ""
-    # Parameter for the age (ms) of a measurement at its timestamp
+    # Parameter for the delay (ms) from measurement to timestamp
     delay: str = ""
     # Parameter that makes EKF2 ignore reported variances if it is 1
     noise_mode: str = ""
@@ -53,24 +53,23 @@ class Aid:
     status_bit: int | None = None
 
     @property
-    def own_parameters(self) -> frozenset[str]:
+    def measurement_parameters(self) -> frozenset[str]:
         """Names of the parameters that affect only the measurements of this aiding source."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged parameters of this aiding source, including the ``switch``."""
+        """Return the logged noise, delay, gate and activation parameters of this aiding source."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged_values[name]) for name in names if name in logged_values}
 
 
 AID_MASK = "EKF2_AID_MASK"
-# Parameter of PX4 main since 2026: EKF2 gets the measurement time of a GNSS fix from the driver
+# Parameter of PX4 main since 2026, with which EKF2 uses the GNSS driver's measurement times
 GNSS_MODE = "EKF2_GPS_MODE"
 # Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
 FLOAT32_TOLERANCE = 1e-6
-# Parameters from PX4 v1.17 on for the age (ms) of a fix of the first GNSS receiver, which EKF2
-# subtracts from the timestamp of the fix
-RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
+# Parameters for the delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
+RECEIVER_DELAY_PARAMETERS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
 class Parameter(NamedTuple):
@@ -96,32 +95,33 @@ class Parameter(NamedTuple):
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-TABLES = table(__file__, "ekf2_parameters.toml", dict)
-# Keys of TABLES whose text contains several names, separated by blanks
-NAME_LISTS = ("axes", "fields", "old_fields", "lever_arm")
+PARAMETER_TABLES = read_toml(__file__, "ekf2_parameters.toml", dict)
+# Keys of PARAMETER_TABLES whose text contains several names, separated by blanks
+NAME_LIST_KEYS = ("axes", "fields", "old_fields", "lever_arm")
 AIDS, DISTURBANCES = (
     {
         name: msgspec.convert(
-            {"name": name, **row} | {key: row[key].split() for key in NAME_LISTS if key in row}, Aid
+            {"name": name, **row} | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
+            Aid,
         )
         for name, row in rows.items()
     }
-    for rows in (TABLES["aids"], TABLES["disturbances"])
+    for rows in (PARAMETER_TABLES["aids"], PARAMETER_TABLES["disturbances"])
 )
 EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     AIDS.__getitem__,
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
-PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
+PARAMETERS = msgspec.convert(PARAMETER_TABLES["parameters"], dict[str, Parameter])
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
-PARAMETER_RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
-FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
+PARAMETER_RANGES = PARAMETERS | msgspec.convert(PARAMETER_TABLES["logged"], dict[str, Parameter])
+FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
-REPORTED_PARAMETERS: tuple[str, ...] = tuple(TABLES["reported"].split())
+REPORTED_PARAMETERS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
 
 
 def effective_settings(
@@ -137,9 +137,9 @@ def effective_settings(
         for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
         if other_aid.switch not in used_switches
         for name in (
-            *other_aid.own_parameters,
+            *other_aid.measurement_parameters,
             *other_aid.lever_arm,
-            *(FIELD_NOISES if other_aid == MAG else ()),
+            *(FIELD_NOISE_PARAMETERS if other_aid == MAG else ()),
         )
     }
     defaults = {
@@ -147,12 +147,12 @@ def effective_settings(
         for name, parameter in PARAMETERS.items()
         if name not in excluded_names
     }
-    if fuses_by_mask(logged_values) and aid == EV_POS:
+    if uses_aid_mask(logged_values) and aid == EV_POS:
         defaults |= OLD_DEFAULTS
     return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}
 
 
-def fuses_by_mask(logged_values: Mapping[str, float]) -> bool:
+def uses_aid_mask(logged_values: Mapping[str, float]) -> bool:
     """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
     return AID_MASK in logged_values and EV_POS.switch not in logged_values
 
@@ -169,9 +169,9 @@ def replace_invalid_parameters(
     >>> replace_invalid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
     {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
     """
-    valid, notes = {}, []
+    valid_values, notes = {}, []
     defaults = {name: parameter.default for name, parameter in PARAMETER_RANGES.items()}
-    if fuses_by_mask(logged_values):
+    if uses_aid_mask(logged_values):
         defaults |= OLD_DEFAULTS
     for name, value in logged_values.items():
         parameter = PARAMETER_RANGES.get(name)
@@ -179,13 +179,13 @@ def replace_invalid_parameters(
         if not math.isfinite(value):
             fault = f"{name} is not a finite number"
         if not fault:
-            valid[name] = value
+            valid_values[name] = value
         elif parameter is None:
             notes.append(f"{fault}; the parameter is not used.")
         else:
-            valid[name] = defaults[name]
-            notes.append(f"{fault}; the default {valid[name]:g} is used.")
-    return valid, tuple(notes)
+            valid_values[name] = defaults[name]
+            notes.append(f"{fault}; the default {valid_values[name]:g} is used.")
+    return valid_values, tuple(notes)
 
 
 def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:

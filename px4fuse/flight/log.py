@@ -10,11 +10,11 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, NotNegative, Record, Sha256, Share, Unavailable
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 
-SHARED_STAMPS = "most timestamps are repeated"
-# Name of the clock of timestamps that PX4 set: converted from the sender's clock, or arrival time
+REPEATED_TIMESTAMPS = "most timestamps are repeated"
+# Name of the clock of a sender in a ULog: PX4 converts or replaces the sender's timestamps
 SENDER_CLOCK = "sender timestamps"
-# Replaces all estimates, re-runs and findings of a flight that is an assignment
-WITHHELD = Unavailable(
+# Replacement for the estimates, re-runs and findings of a flight that is a student assignment
+DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is an assignment, so px4fuse withholds its diagnosis",
     "Analyse the flight with your own settings, and give your diagnosis with --answers.",

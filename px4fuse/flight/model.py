@@ -33,13 +33,13 @@ TableOrUnavailable = pd.DataFrame | Unavailable
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
-# Minimum fraction of intervals that are at most three times the median; with fewer, samples arrive
-# in bursts
+# Minimum fraction of sample intervals of at most three median intervals: with a smaller fraction,
+# samples arrive in bursts
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 # Reason why a source that measures only the height has no positions
-HEIGHT_ONLY = "x and y are NaN in all messages, so the source measures only the height"
+HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
 # Minimum number of positions to estimate their noise
@@ -129,9 +129,9 @@ class Alignment(Record, frozen=True, kw_only=True):
     correlation: float | None = None
     # Horizontal residual (RMS per axis); None if the reference has no position
     residual_rms_m: NotNegative | None = None
-    # Sentences on errors of the frame
+    # One sentence per error of the frame: wrong axes, yaw or origin
     misplaced: tuple[str, ...] = ()
-    # Sentences on values with a large uncertainty
+    # One sentence per estimate with a large uncertainty
     warnings: tuple[str, ...]
 
 
@@ -161,13 +161,13 @@ class PositionTrack:
     orientation: pd.DataFrame | None = None
     # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None
-    # Delay from measurement to timestamp that EKF2 assumes; it is already subtracted
-    age_s: float = 0.0
+    # Delay from measurement to timestamp that EKF2 assumes; already subtracted from the times
+    assumed_delay_s: float = 0.0
     # Barometer height ``down_m``, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
     # Position of the sensor in the body frame (FRD) that EKF2 assumes
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # Sentences on joined and dropped samples
+    # One sentence per kind of sample that was interpolated, reconstructed or dropped
     notes: tuple[str, ...] = ()
     # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0) or "held" (the last
     # position sent again)
@@ -180,7 +180,7 @@ class PositionTrack:
     __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
-        """Return the aiding source of EKF2 that fuses this track along an axis, if any."""
+        """Return EKF2's aiding source for the positions of this track along an axis, if any."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
@@ -240,7 +240,7 @@ def reset_times_s(track: PositionTrack) -> Array:
     return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
 
 
-def positions_of(source: PositionTrack) -> str:
+def positions_phrase(source: PositionTrack) -> str:
     """Return the noun phrase for the positions of a source: "UWB positions"."""
     if source.origin.kind == "file":
         return "positions in the position file"
@@ -302,9 +302,9 @@ class FusionRecord:
     # The horizontal position is NaN if PX4 stores latitude and longitude
     delayed: pd.DataFrame
     # True if the PX4 release stores biases as increments per prediction (up to v1.14)
-    per_step_biases: bool
-    # Horizontal aiding sources besides the external vision position that EKF2 fused
-    other_aiding: tuple[str, ...]
+    stores_bias_increments: bool
+    # Names of the horizontal aiding sources that EKF2 fused, without external vision position
+    other_horizontal_aids: tuple[str, ...]
     # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
     # Measured magnetic field (body FRD), ``fused_3d`` (1 while EKF2 fuses all components, 0 for
@@ -334,9 +334,11 @@ class FusionRecord:
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
         """Return True for each time at which EKF2 was in one of its logged ``states``."""
-        steps = self.states.get(state)
+        step_function = self.states.get(state)
         return (
-            np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
+            np.zeros(len(times_s), bool)
+            if step_function is None
+            else step_values_at(step_function, times_s) > 0.0
         )
 
 
@@ -358,7 +360,7 @@ class AidLog:
     # Number of innovations that were dropped because no variance is near in time
     excluded_count: int = 0
     # Times of innovations for which the log does not show whether EKF2 fused them
-    unknown_fusion_s: Array = field(default_factory=lambda: np.zeros(0))
+    unknown_fusion_times_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
@@ -394,15 +396,15 @@ class Ekf2:
     # ``yaw``
     fusion_flags: TableOrUnavailable
     resets: tuple[Reset, ...]
-    # (Start time, primary instance from then on)
+    # Start time (s) and number of each primary instance of EKF2
     instances: tuple[tuple[float, int], ...]
-    # EKF2_EVP_GATE (√S)
+    # Innovation gate (√S) of the position source, for example EKF2_EVP_GATE
     gate: float
     # Sentences on dropped samples and on the origin of the timestamps
     notes: tuple[str, ...] = ()
     # Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force
     accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
-    # Prediction interval
+    # Prediction interval (s) of EKF2
     step_s: float = EKF2_STEP_S
     # Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
     # propagated to t with the IMU

@@ -62,7 +62,7 @@ class Origin(Record, frozen=True):
         return self.kind == "gnss"
 
     @property
-    def preference(self) -> int:
+    def preference_rank(self) -> int:
         """Index of this origin in :data:`ORIGINS`; a smaller index is preferred."""
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 

@@ -24,7 +24,7 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import WITHHELD, Stream
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD, Stream
 from px4fuse.flight.model import (
     Ekf2,
     Flight,
@@ -32,7 +32,7 @@ from px4fuse.flight.model import (
     Unavailable,
     sample_rate,
 )
-from px4fuse.info.tables import NO_POSITION, unavailable_parts
+from px4fuse.info.tables import NO_POSITION, list_missing_data
 from px4fuse.request import ComparisonRequest, with_options
 
 SCHEMA_NAME = "px4fuse-info"
@@ -40,7 +40,7 @@ SCHEMA_VERSION = "1.0"
 # Fields of Flight that the JSON output of px4fuse info contains without change
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
 # Label of each kind of data, by its name in Flight.streams
-PART_LABELS = {
+DATA_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
     "position": "position",
@@ -96,7 +96,7 @@ class Source:
     Attributes
     ----------
     part : str
-        Kind of data: a value of :data:`PART_LABELS`.
+        Kind of data: a value of :data:`DATA_LABELS`.
     name : str
         Name of a position track, or else of the first topic.
     log : str
@@ -174,10 +174,10 @@ def take_inventory(flight: Flight) -> Inventory:
     return Inventory(
         flight=flight,
         start_utc=utc_time(log.start_unix_s),
-        sources=tuple(_sources(flight, comparison, reason)),
+        sources=tuple(_list_sources(flight, comparison, reason)),
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
-        abilities=tuple(_analysis_options(flight, comparison, reason)),
+        abilities=tuple(_list_options(flight, comparison, reason)),
         advice=_logging_advice(flight, comparison, remedy),
         notes=(
             *log.damage,
@@ -189,7 +189,7 @@ def take_inventory(flight: Flight) -> Inventory:
     )
 
 
-def to_plain(inventory: Inventory) -> dict[str, Any]:
+def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     """Convert the inventory of a log to JSON types, without unknown values."""
     inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
     flight: Flight = inventory_fields.pop("flight")
@@ -200,31 +200,31 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
 
 
-def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
+def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
     """Return all data of a flight except positions, by their names in Flight.streams."""
     ekf2, truth = flight.ekf2, flight.truth
-    data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
+    data_by_stream = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
-        data_by_part["ekf2_state"] = ekf2
+        data_by_stream["ekf2_state"] = ekf2
     else:
         # innovations along the axis with the most samples
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
-        data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
+        data_by_stream |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
+        data_by_stream |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
-    return {**data_by_part, "truth": samples, "airborne": flight.airborne}
+    return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
 
 
-def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
-    data_by_part = _data_by_part(flight)
-    for key, name in PART_LABELS.items():
-        if key in data_by_part:
-            yield _source(name, data_by_part[key], flight.streams.get(key))
+def _list_sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
+    data_by_stream = _data_by_stream(flight)
+    for key, name in DATA_LABELS.items():
+        if key in data_by_stream:
+            yield _make_source(name, data_by_stream[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            yield _source(
+            yield _make_source(
                 name,
                 track.samples,
                 track,
@@ -236,7 +236,7 @@ def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iter
             yield Source(name, unavailable=reason)
 
 
-def _source(
+def _make_source(
     part: str,
     data: pd.DataFrame | TimeSpans | Unavailable,
     stream: Stream | PositionTrack | None,
@@ -257,38 +257,38 @@ def _source(
     if isinstance(data, pd.DataFrame) and len(data) > 1:
         source_fields |= {
             "rate_hz": sample_rate(data),
-            "gaps": _measure_gaps(data, is_imu=part == PART_LABELS["imu"]),
+            "gaps": _measure_gaps(data, is_imu=part == DATA_LABELS["imu"]),
         }
     return Source(part, **source_fields)
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     """Measure intervals longer than 0.1 s (IMU) or 1 s, and than five median intervals."""
-    intervals = np.diff(samples.index.to_numpy())
+    intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
-        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
+        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
         else float(max_interval_s(1.0 / sample_rate(samples)))
     )
-    long_intervals = intervals[intervals > limit_s]
+    long_intervals_s = intervals_s[intervals_s > limit_s]
     return Gaps(
-        len(long_intervals),
-        float(long_intervals.sum()),
-        float(long_intervals.max(initial=0.0)),
+        len(long_intervals_s),
+        float(long_intervals_s.sum()),
+        float(long_intervals_s.max(initial=0.0)),
         limit_s,
     )
 
 
-def _analysis_options(
+def _list_options(
     flight: Flight, comparison: Comparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
     if comparison is None:
         yield AnalysisOption("compare", False, reason)
     else:
         source, segment = comparison.source, comparison.segment
-        count = len(cut_to_segment(source.samples, segment))
+        sample_count = len(cut_to_segment(source.samples, segment))
         description = (
-            f"KF with {count} samples of position source {source.name} from "
+            f"KF with {sample_count} samples of position source {source.name} from "
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
         )
         yield AnalysisOption("compare", True, description)
@@ -299,25 +299,28 @@ def _analysis_options(
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
     yield from _analyses_against_ekf2_and_truth(flight, comparison)
-    aids, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
-    if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
-        rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
+    results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
+    if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
+        rates = (
+            f"{aid.label} {_rate_text(ekf2.aids[name].samples)}"
+            for name, aid in results_by_aid.items()
+        )
         description = ", ".join(rates)
-    yield _analysis_option("aids", aids, description)
+    yield _make_option("aids", results_by_aid, description)
     inputs, description = prepare_inputs(flight), ""
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay of {replayed_s:.0f} s with {inputs.aid.label}"
-    yield _analysis_option("what-if", inputs, description)
+    yield _make_option("what-if", inputs, description)
 
 
 def _rate_text(samples: pd.DataFrame) -> str:
     return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
-def _analysis_option(name: str, part: object, description: str) -> AnalysisOption:
-    if isinstance(part, Unavailable):
-        return AnalysisOption(name, False, part.reason)
+def _make_option(name: str, data: object, description: str) -> AnalysisOption:
+    if isinstance(data, Unavailable):
+        return AnalysisOption(name, False, data.reason)
     return AnalysisOption(name, True, description)
 
 
@@ -325,25 +328,25 @@ def _analyses_against_ekf2_and_truth(
     flight: Flight, comparison: Comparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that compare KF with EKF2 and with ground truth."""
-    parts: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
-    parts["error"] = flight.truth
+    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
+    data_by_analysis["error"] = flight.truth
     if comparison is not None:
-        line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
+        main_line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
         state, variance, truth = project_tracks(
-            ekf2, comparison.flight.truth, line, segment
+            ekf2, comparison.flight.truth, main_line, segment
         ).values()
         innovations = (
             ekf2
             if isinstance(ekf2, Unavailable)
-            else project_innovations(flight, ekf2, comparison.source, line, segment)
+            else project_innovations(flight, ekf2, comparison.source, main_line, segment)
         )
-        parts = dict(zip(parts, (state, variance, innovations, truth), strict=True))
-    for name, part in parts.items():
-        has_data = not isinstance(part, Unavailable)
-        count = f"{len(part)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(part, pd.DataFrame) else ""
-        yield _analysis_option(
-            name, NO_COMPARISON if comparison is None and has_data else part, count
+        data_by_analysis = dict(
+            zip(data_by_analysis, (state, variance, innovations, truth), strict=True)
         )
+    for name, data in data_by_analysis.items():
+        has_data = not isinstance(data, Unavailable)
+        count = f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+        yield _make_option(name, NO_COMPARISON if comparison is None and has_data else data, count)
 
 
 def _logging_advice(
@@ -351,7 +354,7 @@ def _logging_advice(
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings on the recording and of missing data, each action once."""
     if flight.log.is_assessed:
-        return (LoggingAdvice("None", (WITHHELD.reason,)),)
+        return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:
@@ -364,13 +367,13 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # a MAVLink recording can contain the main parts only, so other advice is for ULogs
-    main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    # other data are missing in every MAVLink recording, so advice on them is for ULogs only
+    mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
-        (part.remedy, part.what)
-        for part in unavailable_parts(flight)
-        if part is not NO_POSITION
-        and (flight.log.has_ulog or any(part is main_part for main_part in main_parts))
+        (missing_data.remedy, missing_data.what)
+        for missing_data in list_missing_data(flight)
+        if missing_data is not NO_POSITION
+        and (flight.log.has_ulog or any(missing_data is data for data in mavlink_data))
     ]
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:

@@ -20,17 +20,17 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Names that replace a placeholder in columns.csv, in one row for each name
-COMPONENTS = {
+# Names that replace each placeholder in columns.csv: each name makes one row
+PLACEHOLDER_NAMES = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),
     "{element}": ("w", "x", "y", "z"),
 }
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# Characters of track names that are not used in file names, as some systems do not allow them
+# Characters of a track name that are replaced in file names: some systems do not allow them
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
 # Maximum length (characters) of a table name, which is a file name
-MAX_NAME_LENGTH = 80
+MAX_TABLE_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
     "the log contains no position track. px4fuse info LOG lists the settings to log positions",
@@ -47,7 +47,7 @@ class DescribedTable:
     columns: pd.DataFrame
 
 
-def with_best_source(flight: Flight) -> Flight:
+def with_source_innovations(flight: Flight) -> Flight:
     """Return the flight with the EKF2 innovations of the default position source."""
     try:
         return select_innovations(flight, choose_source(flight)[0])
@@ -58,30 +58,30 @@ def with_best_source(flight: Flight) -> Flight:
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     """Return the tables of a flight by name, with one row per sample.
 
-    Data that are missing in the log have no table; see :func:`unavailable_parts`.
+    Data that are missing in the log have no table; see :func:`list_missing_data`.
     """
-    return {table.name: table.data for table in _tables(flight)}
+    return {table.name: table.data for table in _described_tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
     """Return the data dictionary (:data:`DICTIONARY_COLUMNS`), with one row per table column."""
-    descriptions = [table.columns for table in _tables(flight)]
+    descriptions = [table.columns for table in _described_tables(flight)]
     if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
     return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
 
 
-def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
+def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
     """List the missing data of a flight, which have no table, with the reasons."""
     ekf2 = flight.ekf2
-    sections: list[object] = [flight.imu, flight.attitude, ekf2]
+    flight_data: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
-        sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusion_flags]
-    sections += [imu_and_attitude(flight), flight.airborne, flight.truth]
-    unavailable = [section for section in sections if isinstance(section, Unavailable)]
+        flight_data += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusion_flags]
+    flight_data += [imu_and_attitude(flight), flight.airborne, flight.truth]
+    missing_data = [data for data in flight_data if isinstance(data, Unavailable)]
     if not flight.positions:
-        unavailable.append(NO_POSITION)
-    return tuple(dict.fromkeys(unavailable))
+        missing_data.append(NO_POSITION)
+    return tuple(dict.fromkeys(missing_data))
 
 
 def description(flight: Flight) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def description(flight: Flight) -> dict[str, Any]:
         ],
         "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
         "clocks": flight.clocks,
-        "missing": tuple(dict.fromkeys((*unavailable_parts(flight), *flight.missing))),
+        "missing": tuple(dict.fromkeys((*list_missing_data(flight), *flight.missing))),
         "unused": flight.unused,
         "inputs": flight.inputs,
     }
@@ -108,28 +108,32 @@ def description(flight: Flight) -> dict[str, Any]:
 def _column_descriptions() -> pd.DataFrame:
     """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
     lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
-    for word, names in COMPONENTS.items():
+    for placeholder, names in PLACEHOLDER_NAMES.items():
         lines = [
-            line.replace(word, name)
+            line.replace(placeholder, name)
             for line in lines
-            for name in (names if word in line else [word])
+            for name in (names if placeholder in line else [placeholder])
         ]
     return pd.read_csv(StringIO("\n".join(lines)), index_col="table", keep_default_na=False)
 
 
-def _table(
+def _describe_table(
     name: str,
     data: pd.DataFrame,
     topics_and_clock: tuple[tuple[str, ...], str] = ((), ""),
     name_in_csv: str = "",
-    **values: str,
+    **placeholder_values: str,
 ) -> DescribedTable:
     """Make a table with the columns that columns.csv lists for ``name_in_csv`` (default ``name``).
 
-    ``values`` replace the names in braces in columns.csv.
+    ``placeholder_values`` replace the names in braces in columns.csv.
     """
     tables_in_csv = ["any table"] * ("time_s" in data) + [name_in_csv or name]
-    columns = _column_descriptions().loc[tables_in_csv].map(lambda cell: cell.format(**values))
+    columns = (
+        _column_descriptions()
+        .loc[tables_in_csv]
+        .map(lambda cell: cell.format(**placeholder_values))
+    )
     topics, clock = topics_and_clock
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
@@ -139,31 +143,35 @@ def _stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
     if isinstance(data, pd.DataFrame):
-        yield _table(name, _with_time_column(data), _topics_and_clock(flight, name))
+        yield _describe_table(name, _with_time_column(data), _topics_and_clock(flight, name))
 
 
 def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
     return data.rename_axis("time_s").reset_index()
 
 
-def _tables(flight: Flight) -> Iterator[DescribedTable]:
+def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
     yield from _stream_table(flight, "imu", flight.imu)
     yield from _stream_table(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        imu, clock = _topics_and_clock(flight, "imu")
-        attitude, _ = _topics_and_clock(flight, "attitude")
-        yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
+        imu_topics, clock = _topics_and_clock(flight, "imu")
+        attitude_topics, _ = _topics_and_clock(flight, "attitude")
+        yield _describe_table(
+            "acceleration_ned", _with_time_column(data), ((*imu_topics, *attitude_topics), clock)
+        )
     for name, track in _named_tracks(flight):
-        values = {"frame": track.frame, "description": track.description}
+        placeholder_values = {"frame": track.frame, "description": track.description}
         topics_and_clock = (track.topics, track.clock)
         data = _with_time_column(track.samples)
-        yield _table(name, data, topics_and_clock, "position", **values)
+        yield _describe_table(name, data, topics_and_clock, "position", **placeholder_values)
         if track.orientation is not None:
             orientation_name = name.replace("position_", "orientation_", 1)
             data = _with_time_column(track.orientation)
-            yield _table(orientation_name, data, topics_and_clock, "orientation", **values)
+            yield _describe_table(
+                orientation_name, data, topics_and_clock, "orientation", **placeholder_values
+            )
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2_tables(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
@@ -171,16 +179,18 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
     log = flight.log
     if not isinstance(flight.airborne, Unavailable):
         flight_times = _numeric_table(["time_s", "end_s"], flight.airborne)
-        yield _table("airborne", flight_times, _topics_and_clock(flight, "airborne"))
+        yield _describe_table("airborne", flight_times, _topics_and_clock(flight, "airborne"))
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
-        yield _table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
+        yield _describe_table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
     if parameters := _parameters(flight):
-        yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
+        yield _describe_table(
+            "parameters", pd.DataFrame(parameters.items(), columns=["name", "value"])
+        )
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         # the column must be float, because distinct_stamps is NaN for a usable clock
-        yield _table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
+        yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
@@ -215,12 +225,12 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     resets = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
-    yield _table("resets", resets, topics_and_clock)
+    yield _describe_table("resets", resets, topics_and_clock)
     # the start time of the first EKF2 instance is minus infinity in a Flight
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
     instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
-    yield _table("instances", instances, topics_and_clock)
+    yield _describe_table("instances", instances, topics_and_clock)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
@@ -228,7 +238,9 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
     used_names: set[str] = set()
     for track in flight.positions:
         # with the prefix, no name is one that Windows reserves (con, aux, ...)
-        stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_NAME_LENGTH].rstrip("_")
+        stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_TABLE_NAME_LENGTH].rstrip(
+            "_"
+        )
         name, number = stem, 1
         while name.lower() in used_names:
             number += 1
@@ -237,6 +249,6 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
         yield name, track
 
 
-def _topics_and_clock(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
-    stream = flight.streams.get(part)
+def _topics_and_clock(flight: Flight, stream_name: str) -> tuple[tuple[str, ...], str]:
+    stream = flight.streams.get(stream_name)
     return ((), "") if stream is None else (stream.topics, stream.clock)

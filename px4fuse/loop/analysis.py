@@ -7,7 +7,7 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
@@ -177,7 +177,7 @@ def _find_true_end(
     if isinstance(truth_end, TrueEnd):
         return truth_end
     if is_assessed:
-        return WITHHELD
+        return DIAGNOSIS_WITHHELD
     flight = segment.flight
     if (
         max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)

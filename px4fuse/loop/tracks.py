@@ -12,10 +12,10 @@ from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.core.arrays import Array
-from px4fuse.core.reading import display_name, read_head, split_part
+from px4fuse.core.reading import display_name, read_head, split_path_and_part
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.log import WITHHELD
+from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
@@ -71,7 +71,9 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         The log does not contain the track. The message contains an action to log it.
     """
     if track_name == "truth" and flight.log.is_assessed:
-        raise MissingDataError(f"{flight.log.name}:truth: {WITHHELD.reason}", WITHHELD.remedy)
+        raise MissingDataError(
+            f"{flight.log.name}:truth: {DIAGNOSIS_WITHHELD.reason}", DIAGNOSIS_WITHHELD.remedy
+        )
     if track_name == "kf":
         return _make_kf_trajectory(flight)
     track_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[
@@ -185,7 +187,7 @@ class LoopSource:
 
 def file_name(source: Path) -> str:
     """Return the start of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
-    path, track_name = split_part(str(source))
+    path, track_name = split_path_and_part(str(source))
     return "_".join([path.stem, *(track_name or "").split("/")]).rstrip("_")
 
 
@@ -230,7 +232,7 @@ def read_source(
     SettingsError
         ``frame`` is given for a flight log.
     """
-    path, track_name = split_part(argument)
+    path, track_name = split_path_and_part(argument)
     head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")

@@ -19,9 +19,9 @@ from mcp.server.mcpserver.resources import FunctionResource
 from mcp.types import CallToolResult, TextContent, Tool
 
 from px4fuse.core.reading import files_by_sha256
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.core.text import one_line
-from px4fuse.core.workers import JobFailure, poll_bounded
+from px4fuse.core.workers import JobFailure, poll_with_limits
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings.model import TITLES
 from px4fuse.results.contract import schema, to_json
@@ -47,7 +47,7 @@ Parse = Callable[[Mapping[str, Any]], tuple[list[str], list[Path]]]
 
 
 # Title and text of each prompt, by its name
-PROMPTS = table(__file__, "prompts.toml", dict[str, dict[str, str]])
+PROMPTS = read_toml(__file__, "prompts.toml", dict[str, dict[str, str]])
 
 
 class Server(MCPServer[Any]):
@@ -125,7 +125,9 @@ class Server(MCPServer[Any]):
         if key in self._cache:
             return self._cache[key]
         receiver, sender = Pipe(duplex=False)
-        jobs = poll_bounded(partial(self._run, sender), [words], 1, *self._limits, max_wait_s=0.0)
+        jobs = poll_with_limits(
+            partial(self._run, sender), [words], 1, *self._limits, max_wait_s=0.0
+        )
         numbers = count(1)
         # closing ends the worker process, also after the client has cancelled the call
         with receiver, sender, closing(jobs):

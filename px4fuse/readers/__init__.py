@@ -7,7 +7,8 @@ from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.readers.formats import refuse_foreign_format
 
-_SNIFF_BYTES = 100
+# Number of bytes at the start of a file that identify its format
+_FORMAT_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # Text files that users give instead of a flight log: suffixes, kind of file and action
 _TEXT_FILES = {
@@ -44,7 +45,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     """
     path = Path(path)
     name = display_name(path)
-    head = read_head(path, _SNIFF_BYTES, LogError)
+    head = read_head(path, _FORMAT_BYTES, LogError)
     # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
     if head.startswith(ULOG_MAGIC):
         if system is not None:

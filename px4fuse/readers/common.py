@@ -16,17 +16,17 @@ MAX_IMU_VALUE = 1e4
 # of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a position from the median position to reject it as not measured
-MIN_FAR_M = 1e4
-# Minimum ratio of the distance of a rejected position to the median distance of all positions
-MIN_FAR_RATIO = 100.0
+MIN_FAR_DISTANCE_M = 1e4
+# Minimum ratio of the distance from the median position to its median, to reject a position
+MIN_FAR_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
 # sources that send each position several times repeat it for a shorter time
 MIN_HELD_S = 1.0
 # Minimum number of equal positions that the source repeats instead of measuring
 MIN_HELD_COUNT = 5
-# Maximum fraction of repeated positions to reject them: with more, the source may be at rest
+# Maximum fraction of repeated positions that are rejected: with more, the vehicle may be at rest
 MAX_HELD_FRACTION = 0.5
-# Maximum deviation of a difference from a multiple of the rounding step, in rounding steps
+# Maximum deviation of a coordinate difference from whole rounding steps, in rounding steps
 MAX_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
@@ -56,8 +56,11 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
-    flying = ", in flight" if in_flight else ""
-    return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
+    flight_text = ", in flight" if in_flight else ""
+    return (
+        f"the file ends within a {unit} after {duration_s:.1f} s{flight_text}; later data are "
+        "missing"
+    )
 
 
 def finite_rows(
@@ -68,29 +71,31 @@ def finite_rows(
     return samples[is_valid]
 
 
-def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
+def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
     """Return the reason for each row that is not a measurement, and "" for all others.
 
     "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "held": the
     last position is sent again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
-    reason = pd.Series("", index=samples.index)
+    reasons = pd.Series("", index=samples.index)
     is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
-    reason[~is_number] = "NaN"
+    reasons[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
     measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
     if len(measured_rows):
         next_index = np.searchsorted(measured_rows, zero_rows)
         neighbours = measured_rows[np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)]
         distance_m = np.linalg.norm(values[neighbours], axis=2).min(axis=0)
-        reason.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
-    valid_rows = np.flatnonzero(reason == "")
+        reasons.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+    valid_rows = np.flatnonzero(reasons == "")
     if len(valid_rows):
         from_median = values[valid_rows] - np.median(values[valid_rows], axis=0)
         distance_m = np.linalg.norm(from_median, axis=1)
-        is_far = distance_m > max(MIN_FAR_M, MIN_FAR_RATIO * float(np.median(distance_m)))
-        reason.iloc[valid_rows[is_far]] = "far"
+        is_far = distance_m > max(
+            MIN_FAR_DISTANCE_M, MIN_FAR_DISTANCE_RATIO * float(np.median(distance_m))
+        )
+        reasons.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
     is_same = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     starts = np.flatnonzero(np.append(True, ~is_same))
@@ -100,8 +105,8 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
         if end - start >= MIN_HELD_COUNT and np.ptp(time_s[valid_rows[start:end]]) >= MIN_HELD_S
     ]
     if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid_rows):
-        reason.iloc[rows] = "held"
-    return reason
+        reasons.iloc[rows] = "held"
+    return reasons
 
 
 def rounding_step(values: Array) -> float:
@@ -134,7 +139,7 @@ def join_nearest(
     )
 
 
-def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
+def rows_with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
@@ -145,7 +150,7 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
 
     A variance of 0 becomes NaN: it means "not sent" (``EKF2.cpp``).
     """
-    orientation = with_attitude(
+    orientation = rows_with_attitude(
         samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)
     )
     quaternions = orientation[Columns.QUATERNION]

@@ -4,17 +4,18 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.core.reading import display_name
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError
 
-_FORMATS = table(__file__, "formats.toml", dict[str, list[dict[str, Any]]])
-STREAMS = _FORMATS["streams"]
+_FORMATS = read_toml(__file__, "formats.toml", dict[str, list[dict[str, Any]]])
+# Formats of streams with positions: name, pattern of a row and pattern of the ranges
+STREAM_FORMATS = _FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, head: bytes, error_type: type[Px4FuseError]) -> None:
     """Raise an error with the name of the format if px4fuse does not read it."""
     name = display_name(path)
-    for foreign in _FORMATS["foreign"]:
-        if any(head.startswith(start.encode("latin-1")) for start in foreign["starts"]):
-            remedy = foreign["remedy"].format(name=name)
-            raise error_type(f"{name}: the file is {foreign['name']}", remedy)
+    for foreign_format in _FORMATS["foreign"]:
+        if any(head.startswith(start.encode("latin-1")) for start in foreign_format["starts"]):
+            remedy = foreign_format["remedy"].format(name=name)
+            raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)

@@ -16,7 +16,7 @@ from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
 # Number of vertex ids, and number of values after the ids, by the tag that begins a line
-_TAGS = {
+_COUNTS_BY_TAG = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
@@ -24,7 +24,7 @@ _TAGS = {
 }
 # Tags of lines that are skipped, or their first letters: laser scans and parameters
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
-_REMEDY = (
+_FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "all other lines."
 )
@@ -54,15 +54,15 @@ def read_g2o(path: str | Path) -> PoseGraph:
     name = display_name(path)
     text = decode_text(read_bytes_limited(path, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{name} is not a text file", _REMEDY)
+        raise TrajectoryError(f"{name} is not a text file", _FORMAT_REMEDY)
     return parse_g2o(text, name)
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
     """Parse the text of a g2o file with the file name ``name``."""
     rows_by_tag = _rows_by_tag(text, name)
-    in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
-    dimension, tag_kind, pose_width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
+    is_in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
+    dimension, tag_kind, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(tag_kind):
             raise rows.row_error(
@@ -71,13 +71,13 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
     edges = rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
-        raise TrajectoryError(f"{name} contains no edges", _REMEDY)
-    edge_vertex_ids, edge_values = _parse(edges, f"EDGE_{tag_kind}")
+        raise TrajectoryError(f"{name} contains no edges", _FORMAT_REMEDY)
+    edge_vertex_ids, edge_values = _parse_rows(edges, f"EDGE_{tag_kind}")
     ids = np.unique(edge_vertex_ids)
     poses = np.zeros((len(ids), pose_width))
     poses[:, 6:] = 1.0  # the identity rotation has w = 1
     if vertices.lines:
-        vertex_ids, poses = _parse(vertices, f"VERTEX_{tag_kind}")
+        vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{tag_kind}")
         order = np.argsort(vertex_ids[:, 0], kind="stable")
         ids = vertex_ids[order, 0]
         poses = _normalise_quaternions(vertices, poses)[order]
@@ -120,24 +120,26 @@ def g2o_text(graph: PoseGraph) -> str:
 
     The text contains the vertices, a FIX of the first vertex, and the edges.
     """
-    kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
+    tag_kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
     poses = zip(ids, graph.poses.tolist(), strict=True)
-    lines = [f"VERTEX_{kind} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses]
+    lines = [
+        f"VERTEX_{tag_kind} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses
+    ]
     lines.append(f"FIX {ids[0]}")
     edge_values = np.hstack(
         [graph.measurements, graph.information[:, upper_triangle[0], upper_triangle[1]]]
     ).tolist()
     edges = zip(graph.first.tolist(), graph.second.tolist(), edge_values, strict=True)
     lines += [
-        f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, values))}" for i, j, values in edges
+        f"EDGE_{tag_kind} {ids[i]} {ids[j]} {' '.join(map(repr, values))}" for i, j, values in edges
     ]
     return "\n".join(lines) + "\n"
 
 
 def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
-    rows_by_tag = {tag: Rows(name) for tag in _TAGS}
+    rows_by_tag = {tag: Rows(name) for tag in _COUNTS_BY_TAG}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
         line = raw_line.partition("#")[0].strip()
@@ -157,13 +159,13 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             fault = f"lines with the tag {quote(tag)} are not supported"
-            raise line_error(name, line_number, fault, _REMEDY)
+            raise line_error(name, line_number, fault, _FORMAT_REMEDY)
     return rows_by_tag
 
 
-def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
+def _parse_rows(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
     """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines with one tag."""
-    vertex_count, value_count = _TAGS[tag]
+    vertex_count, value_count = _COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = np.array(
         [

@@ -75,17 +75,17 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     ekf2 = _read_ekf2(recording, parameters, autopilot)
     # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
     delay_parameters = effective_settings(parameters, GNSS_POS) if autopilot == "PX4" else {}
-    delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
+    gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
     positions, missing_positions = read_positions(
-        recording, clock_mappings, remedies["position"], delay_s
+        recording, clock_mappings, remedies["position"], gnss_delay_s
     )
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
-    in_flight = common.ends_in_flight(airborne, recording.duration_s)
+    is_in_flight = common.ends_in_flight(airborne, recording.duration_s)
     pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     return Flight(
         # The log description is made last, because it counts the samples that the readers dropped
-        log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
+        log=_describe_log(recording, parameters, parameter_faults, autopilot, is_in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -112,12 +112,12 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     if len(rows) < 2:
         layout, rows = max(candidates, key=lambda pair: len(pair[1]))
     if len(rows) < 2:
-        reason = "the recording contains no HIGHRES_IMU or SCALED_IMU"
+        reasons = ["the recording contains no HIGHRES_IMU or SCALED_IMU"]
         if raw_count := len(recording.rows("RAW_IMU")):
-            reason += (
-                f"; {raw_count} RAW_IMU messages are not used, because raw counts have no unit"
+            reasons.append(
+                f"{raw_count} RAW_IMU messages are not used, because raw counts have no unit"
             )
-        return Unavailable("IMU", reason, remedy)
+        return Unavailable("IMU", "; ".join(reasons), remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
@@ -136,7 +136,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
 
 def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
     layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
-    attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
+    attitude = common.rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
         return Unavailable("attitude", f"the recording contains no usable {names}", remedy)
@@ -148,16 +148,18 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
-    counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
+    message_counts = {
+        layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
+    }
     # ODOMETRY has variances, so it is preferred unless its message rate is below half of the
     # highest message rate
     layout = next(
         layout
         for layout in messages.STATE_LAYOUTS
-        if 2 * counts[layout.topic] >= max(counts.values())
+        if 2 * message_counts[layout.topic] >= max(message_counts.values())
     )
-    message = layout.topic
-    if counts[message] < 2:
+    message_name = layout.topic
+    if message_counts[message_name] < 2:
         return Unavailable(
             "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
         )
@@ -166,11 +168,11 @@ def _read_ekf2(
     if len(state) < 2:
         return Unavailable(
             "EKF2",
-            f"{message} contains no finite EKF2 state",
+            f"{message_name} contains no finite EKF2 state",
             "Start the recording after EKF2 has started.",
         )
-    recording.record_stream("ekf2_state", message)
-    notes = [f"the EKF2 state is from {message}, which the autopilot sent"]
+    recording.record_stream("ekf2_state", message_name)
+    notes = [f"the EKF2 state is from {message_name}, which the autopilot sent"]
     if autopilot != "PX4":
         notes.append(f"the name EKF2 stands for the estimator of {autopilot}")
     if "reset_counter" in samples and (
@@ -183,7 +185,7 @@ def _read_ekf2(
     variance_rows = samples.reindex(columns=VARIANCE_COLUMNS)
     variance_rows = variance_rows[(variance_rows > 0.0).all(axis=1)]
     if variance_rows.empty:
-        message = messages.LAYOUTS["accuracy"].topic
+        message_name = messages.LAYOUTS["accuracy"].topic
         variance_rows = _variance_from_accuracy(recording)
         if len(variance_rows):
             notes.append(
@@ -198,7 +200,7 @@ def _read_ekf2(
             remedies["variance"],
         )
     else:
-        recording.record_stream("ekf2_variance", message)
+        recording.record_stream("ekf2_variance", message_name)
     return Ekf2(
         state=state,
         variance=variance,
@@ -273,27 +275,27 @@ def _describe_log(
     parameters: Mapping[str, float],
     parameter_faults: tuple[str, ...],
     autopilot: str,
-    in_flight: bool,
+    is_in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
     truncation = (
-        (common.format_truncation("frame", recording.duration_s, in_flight),)
+        (common.format_truncation("frame", recording.duration_s, is_in_flight),)
         if frames.ends_in_frame
         else ()
     )
     firmware = f"{autopilot} (version not in the recording)"
     firmware_hash = "unknown"
     vehicle = ""
-    rows = recording.rows("AUTOPILOT_VERSION")
-    if len(rows):
-        version = frames.table("AUTOPILOT_VERSION", rows[:1])[0]
+    version_rows = recording.rows("AUTOPILOT_VERSION")
+    if len(version_rows):
+        version = frames.table("AUTOPILOT_VERSION", version_rows[:1])[0]
         major, minor, patch, _ = int(version["flight_sw_version"]).to_bytes(4, "big")
         if major or minor or patch:
             firmware = f"{autopilot} v{major}.{minor}.{patch}"
         hash_hex = bytes(version["flight_custom_version"][::-1]).hex()
         firmware_hash = hash_hex if hash_hex.strip("0") else "unknown"
-        uid = bytes(version["uid2"]).hex()
-        vehicle = uid if uid.strip("0") else ""
+        hardware_id = bytes(version["uid2"]).hex()
+        vehicle = hardware_id if hardware_id.strip("0") else ""
     vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
     dropped = sorted(recording.dropped.items())
@@ -317,8 +319,8 @@ def _describe_log(
         senders=senders.describe_senders(recording),
         vehicle=vehicle,
         damage=(*truncation, *recording.damage),
-        ends_in_flight=in_flight,
-        bytes_read=len(frames.content) - frames.bad_bytes,
+        ends_in_flight=is_in_flight,
+        bytes_read=len(frames.content) - frames.bad_byte_count,
     )
 
 
@@ -334,6 +336,6 @@ def _start_unix_s(recording: Recording) -> float | None:
     if unix_line is not None:
         return float(unix_line.at(recording.zero_s))
     received_us = recording.frames.received_us
-    if received_us is None or not recording.boot_of_receipt.pairs:
+    if received_us is None or not recording.receipt_to_boot.pairs:
         return None
-    return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(recording.zero_s))
+    return float(received_us[0] * 1e-6 + recording.receipt_to_boot.inverse().at(recording.zero_s))

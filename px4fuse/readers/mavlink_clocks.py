@@ -133,7 +133,7 @@ def map_clock(
     name: str,
     stamp_s: Array,
     received_s: Array,
-    boot_of_receipt: ClockLine,
+    receipt_to_boot: ClockLine,
     replies: tuple[Array, Array],
     answers: tuple[Array, Array],
     map_boot_to_unix: ClockLine | None,
@@ -144,7 +144,7 @@ def map_clock(
 
     Parameters
     ----------
-    boot_of_receipt : ClockLine
+    receipt_to_boot : ClockLine
         Map from receive time to boot clock.
     replies : tuple of ndarray
         Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
@@ -156,7 +156,7 @@ def map_clock(
         False if the recording contains only the order of the messages, no receive times.
     """
     time_source = "receive time" if has_receipt else "position in the stream"
-    boot_at_receipt = boot_of_receipt.at(received_s)
+    boot_at_receipt = receipt_to_boot.at(received_s)
     if not is_running_clock(stamp_s):
         distinct_count = len(np.unique(stamp_s))
         note = (
@@ -186,24 +186,26 @@ def map_clock(
         unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
-        line = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
+        boot_line = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "the timestamps of the sender are boot times of the autopilot"
-        return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
+        return ClockMapping(
+            boot_line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note)
+        )
     clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidates = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
     if clock_kind == "UNIX time" and map_boot_to_unix is not None:
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
-    for method, line, note in candidates:
+    for method, boot_line, note in candidates:
         # TIMESYNC or SYSTEM_TIME of another clock gives boot times far from the receive times
-        if distance_s(line.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
-            return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
-    line = fit_least_delay(stamp_s, received_s)
-    slope = line.slope * boot_of_receipt.slope
-    line = replace(line, y0=float(boot_of_receipt.at(line.y0)), slope=slope)
+        if distance_s(boot_line.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
+            return ClockMapping(boot_line, _clock_map(clock_name, method, boot_line, stamp_s, note))
+    boot_line = fit_least_delay(stamp_s, received_s)
+    slope = boot_line.slope * receipt_to_boot.slope
+    boot_line = replace(boot_line, y0=float(receipt_to_boot.at(boot_line.y0)), slope=slope)
     note = "without TIMESYNC and SYSTEM_TIME the mapped times are late by the minimum link delay"
-    return ClockMapping(line, _clock_map(clock_name, time_source, line, stamp_s, note))
+    return ClockMapping(boot_line, _clock_map(clock_name, time_source, boot_line, stamp_s, note))
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> ClockLine | None:

@@ -21,16 +21,16 @@ from pymavlink.dialects.v20 import all as dialect
 from px4fuse.core.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
-Integers = NDArray[np.int64]
+Int64Array = NDArray[np.int64]
 # Address of a sender: MAVLink system id and component id
 Address = tuple[int, int]
 
-MAGIC_BYTE_1, MAGIC_BYTE_2 = 0xFE, 0xFD
-HEADER_BYTES_1, HEADER_BYTES_2 = 6, 10
+MAGIC_BYTE_V1, MAGIC_BYTE_V2 = 0xFE, 0xFD
+HEADER_BYTES_V1, HEADER_BYTES_V2 = 6, 10
 CHECKSUM_BYTES = 2
 SIGNATURE_BYTES = 13
 SIGNED_FLAG = 0x01
-MAX_FRAME_BYTES = HEADER_BYTES_2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
+MAX_FRAME_BYTES = HEADER_BYTES_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 RECEIVE_TIME_BYTES = 8
 # Number of bytes in which frames are searched at once, to limit the memory for malicious files
@@ -68,23 +68,23 @@ class Frames:
     content: bytes
     sha256: str
     # Offset of each frame's first byte in the content
-    start: Integers
+    start: Int64Array
     message_id: NDArray[np.int32]
     system: NDArray[np.uint8]
     component: NDArray[np.uint8]
     sequence: NDArray[np.uint8]
-    payload_start: Integers
+    payload_start: Int64Array
     payload_length: NDArray[np.uint8]
     # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
-    received_us: Integers | None
+    received_us: Int64Array | None
     # Number of complete frames with messages that are not in the dialect
     unknown_frame_count: int
     # Number of bytes that are not part of a frame
-    bad_bytes: int
+    bad_byte_count: int
     # True if the file ends within a frame
     ends_in_frame: bool
     # Number of damaged receive times
-    damaged_receive_times: int
+    damaged_receive_time_count: int
 
     def __len__(self) -> int:
         return len(self.start)
@@ -105,14 +105,14 @@ class Frames:
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
-        source = np.frombuffer(self.content, dtype=np.uint8)
+        content_bytes = np.frombuffer(self.content, dtype=np.uint8)
         starts = self.payload_start[rows]
         lengths = self.payload_length[rows]
         for length in np.unique(lengths).tolist():
             byte_count = min(length, layout.itemsize)
             if byte_count:
                 rows_of_length = np.flatnonzero(lengths == length)
-                windows = np.lib.stride_tricks.sliding_window_view(source, byte_count)
+                windows = np.lib.stride_tricks.sliding_window_view(content_bytes, byte_count)
                 # Indexing copies the payloads, so frames are decoded in batches
                 for batch_start in range(0, len(rows_of_length), DECODE_BATCH_SIZE):
                     batch_rows = rows_of_length[batch_start : batch_start + DECODE_BATCH_SIZE]
@@ -159,13 +159,13 @@ def read_frames(name: str, content: bytes) -> Frames:
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
-    is_version_2 = content_bytes[start] == MAGIC_BYTE_2
+    is_version_2 = content_bytes[start] == MAGIC_BYTE_V2
     # Three consecutive header bytes: sequence, system, component
     sequence_offset = start + np.where(is_version_2, 4, 2)
-    unknown_frame_count, bad_bytes, ends_in_frame = _count_other_bytes(
+    unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
         content, start - time_bytes, end, time_bytes
     )
-    received_us, damaged_receive_times = (
+    received_us, damaged_receive_time_count = (
         _read_receive_times(content_bytes, start, end) if time_bytes else (None, 0)
     )
     return Frames(
@@ -177,17 +177,17 @@ def read_frames(name: str, content: bytes) -> Frames:
         system=content_bytes[sequence_offset + 1],
         component=content_bytes[sequence_offset + 2],
         sequence=content_bytes[sequence_offset],
-        payload_start=start + np.where(is_version_2, HEADER_BYTES_2, HEADER_BYTES_1),
+        payload_start=start + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_length=content_bytes[start + 1],
         received_us=received_us,
         unknown_frame_count=unknown_frame_count,
-        bad_bytes=bad_bytes,
+        bad_byte_count=bad_byte_count,
         ends_in_frame=ends_in_frame,
-        damaged_receive_times=damaged_receive_times,
+        damaged_receive_time_count=damaged_receive_time_count,
     )
 
 
-def _find_valid_frames(content: bytes) -> Integers:
+def _find_valid_frames(content: bytes) -> Int64Array:
     """Return start, end and message id, shape (n, 3), of all frames with valid checksums."""
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     view = memoryview(content)
@@ -204,7 +204,7 @@ def _find_valid_frames(content: bytes) -> Integers:
     return np.concatenate(valid_frames)
 
 
-def _remove_nested_frames(frames: Integers) -> Integers:
+def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     """Remove frames that begin inside the previous frame.
 
     The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. Such
@@ -229,34 +229,34 @@ def _remove_nested_frames(frames: Integers) -> Integers:
 
 def _find_possible_frames(
     content_bytes: NDArray[np.uint8], block_start: int
-) -> tuple[Integers, Integers]:
+) -> tuple[Int64Array, Int64Array]:
     """Return start, end and message id of possible frames in a block, and checksum offsets."""
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
-    start = block_start + np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2))
-    header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
+    start = block_start + np.flatnonzero((block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2))
+    header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1)
     has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
     start = start[has_whole_header]
     header_bytes = header_bytes[has_whole_header]
-    is_version_2 = header_bytes == HEADER_BYTES_2
-    start_2 = start[is_version_2]
+    is_version_2 = header_bytes == HEADER_BYTES_V2
+    start_v2 = start[is_version_2]
     message_id = content_bytes[start + 5].astype(np.int64)
     message_id[is_version_2] = (
-        content_bytes[start_2 + 7] | content_bytes[start_2 + 8].astype(np.int64) << 8
+        content_bytes[start_v2 + 7] | content_bytes[start_v2 + 8].astype(np.int64) << 8
     )
     is_candidate = _CRC_EXTRA[message_id] >= 0
-    is_candidate[is_version_2] &= (content_bytes[start_2 + 9] == 0) & (
-        content_bytes[start_2 + 2] <= SIGNED_FLAG
+    is_candidate[is_version_2] &= (content_bytes[start_v2 + 9] == 0) & (
+        content_bytes[start_v2 + 2] <= SIGNED_FLAG
     )
     crc_end = start + content_bytes[start + 1] + header_bytes
     end = crc_end + CHECKSUM_BYTES
-    end[is_version_2] += SIGNATURE_BYTES * (content_bytes[start_2 + 2] & SIGNED_FLAG).astype(
+    end[is_version_2] += SIGNATURE_BYTES * (content_bytes[start_v2 + 2] & SIGNED_FLAG).astype(
         np.int64
     )
     is_candidate &= end <= len(content_bytes)
     return np.stack([start, end, message_id], axis=1)[is_candidate], crc_end[is_candidate]
 
 
-def _has_receive_times(start: Integers, end: Integers) -> bool:
+def _has_receive_times(start: Int64Array, end: Int64Array) -> bool:
     """Return True if most frames are separated by the eight bytes of a receive time."""
     gap_bytes = start[1:] - end[:-1]
     with_time_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
@@ -267,7 +267,7 @@ def _has_receive_times(start: Integers, end: Integers) -> bool:
 
 
 def _count_other_bytes(
-    content: bytes, start: Integers, end: Integers, time_bytes: int
+    content: bytes, start: Int64Array, end: Int64Array, time_bytes: int
 ) -> tuple[int, int, bool]:
     """Count unknown frames and other bytes between the valid frames.
 
@@ -275,7 +275,7 @@ def _count_other_bytes(
     a receive time.
     """
     unknown_frame_count = 0
-    bad_bytes = 0
+    bad_byte_count = 0
     last_bytes = b""
     gap_starts = np.append(0, end)
     gap_ends = np.append(start, len(content))
@@ -286,25 +286,25 @@ def _count_other_bytes(
         for size in _unknown_frames(content, gap_start, gap_end, time_bytes):
             unknown_frame_count += 1
             offset += size
-        bad_bytes += gap_end - offset
+        bad_byte_count += gap_end - offset
         last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
-    begins_frame = {*last_bytes[time_bytes : time_bytes + 1]} <= {MAGIC_BYTE_1, MAGIC_BYTE_2}
+    begins_frame = {*last_bytes[time_bytes : time_bytes + 1]} <= {MAGIC_BYTE_V1, MAGIC_BYTE_V2}
     ends_in_frame = 0 < len(last_bytes) < time_bytes + MAX_FRAME_BYTES and begins_frame
-    return unknown_frame_count, bad_bytes, ends_in_frame
+    return unknown_frame_count, bad_byte_count, ends_in_frame
 
 
 def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) -> Iterator[int]:
     """Yield the sizes (bytes) of consecutive frames of unknown messages, from their headers."""
-    while offset + time_bytes + HEADER_BYTES_1 + CHECKSUM_BYTES <= gap_end:
-        header = content[offset + time_bytes : offset + time_bytes + HEADER_BYTES_2]
+    while offset + time_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
+        header = content[offset + time_bytes : offset + time_bytes + HEADER_BYTES_V2]
         message_id = header[5]
-        size = time_bytes + header[1] + HEADER_BYTES_1 + CHECKSUM_BYTES
-        if header[0] == MAGIC_BYTE_2:
+        size = time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
+        if header[0] == MAGIC_BYTE_V2:
             message_id = int.from_bytes(header[7:10], "little")
-            size += HEADER_BYTES_2 - HEADER_BYTES_1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
+            size += HEADER_BYTES_V2 - HEADER_BYTES_V1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
         offset += size
         if (
-            header[0] not in (MAGIC_BYTE_1, MAGIC_BYTE_2)
+            header[0] not in (MAGIC_BYTE_V1, MAGIC_BYTE_V2)
             or message_id in dialect.mavlink_map
             or offset > gap_end
         ):
@@ -313,8 +313,8 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 
 
 def _read_receive_times(
-    content_bytes: NDArray[np.uint8], start: Integers, end: Integers
-) -> tuple[Integers, int]:
+    content_bytes: NDArray[np.uint8], start: Int64Array, end: Int64Array
+) -> tuple[Int64Array, int]:
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES

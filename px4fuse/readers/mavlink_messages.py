@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.flight.model import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
@@ -24,7 +24,7 @@ ARDUPILOT_REPLAY = Unavailable(
     "Use the logged state of EKF3.",
 )
 # Messages with the boot time in time_usec; in other messages time_usec may be from another clock
-STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
+BOOT_CLOCK_MESSAGES = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # Messages that only an autopilot sends; they identify the autopilot among the senders
 AUTOPILOT_MESSAGES = (
     "HIGHRES_IMU",
@@ -82,7 +82,7 @@ class FrameOfReference:
     body: bool = False
 
 
-_TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 assert not any(row.optional for row in LAYOUTS.values()), "mavlink_messages.toml: use `columns`"
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])

@@ -26,7 +26,7 @@ from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unpr
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
 # Maximum time difference (s) between a global and a local position to compute the origin: an error
 # of 5 cm at 1 m/s
-MAX_STATE_DISTANCE_S = 0.05
+MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
@@ -54,7 +54,7 @@ def read_positions(
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
         tracks_and_missing += tracks or [
-            px4_positions.unavailable(
+            px4_positions.unavailable_source(
                 message, f"the recording contains no {message} sent to the autopilot", remedy
             )
         ]
@@ -122,19 +122,19 @@ def _read_gnss(
     rows = recording.rows(layout.topic)
     if not len(rows):
         return None
-    count = len(rows)
+    message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
-    receipt_s = recording.receipt_boot_s(rows)
-    if len(rows) and np.median(np.abs(receipt_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
-        boot_s = receipt_s  # the timestamps are UNIX time, or the recording has no boot clock
+    receipt_boot_s = recording.receipt_boot_s(rows)
+    if len(rows) and np.median(np.abs(receipt_boot_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
+        boot_s = receipt_boot_s  # the timestamps are UNIX time, or the recording has no boot clock
     fixes = recording.read(layout, rows, boot_s - delay_s)
-    fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
+    fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         fix_count = "none" if fixes.empty else f"only {len(fixes)}"
-        return px4_positions.unavailable(
+        return px4_positions.unavailable_source(
             layout.topic,
-            f"{count} messages, {fix_count} with a 3D fix",
+            f"{message_count} messages, {fix_count} with a 3D fix",
             "Give the antenna a free view of the sky and wait for a fix.",
         )
     samples = project_to_ned(fixes, local_origin(recording))
@@ -149,7 +149,7 @@ def _read_gnss(
         clock=f"{BOOT_CLOCK} minus {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
         log=recording.frames.name,
-        age_s=delay_s,
+        assumed_delay_s=delay_s,
     )
 
 
@@ -171,14 +171,17 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     joined = join_nearest(
         recording.read(messages.LAYOUTS["global_state"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
-        MAX_STATE_DISTANCE_S,
+        MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()
     joined = joined[joined["latitude_deg"] != 0.0]
     if joined.empty:
         return None
-    pairs = zip(joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True)
+    position_pairs = zip(
+        joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True
+    )
     origins = [
-        (*unproject(-n, -e, tuple(position[:2])), position[2] + d) for position, (n, e, d) in pairs
+        (*unproject(-n, -e, tuple(position[:2])), position[2] + d)
+        for position, (n, e, d) in position_pairs
     ]
     return tuple(np.median(origins, axis=0).tolist())
 
@@ -209,7 +212,7 @@ def read_truth(
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = pd.concat([project_to_ned(samples, origin), samples[Columns.VELOCITY]], axis=1)
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
+    mocap_truth = px4_positions.motion_capture_truth(positions, "ATT_POS_MOCAP")
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

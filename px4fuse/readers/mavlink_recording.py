@@ -26,7 +26,7 @@ from px4fuse.readers.mavlink_frames import (
     message_name,
     wire_layout,
 )
-from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
+from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, FRAMES_OF_REFERENCE
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 BOOT_CLOCK = "autopilot boot clock"
@@ -41,7 +41,7 @@ MIN_GROUP_FRACTION = 0.01
 # Maximum distance (s) of a valid timestamp from the analysed session, or from the next timestamp
 MAX_OUTSIDE_S = 60.0
 # Maximum fraction of bytes outside of MAVLink frames in a file without damage
-MAX_LOST_FRACTION = 0.002
+MAX_STRAY_BYTE_FRACTION = 0.002
 # Minimum number of equal boot timestamps that show that the field is not a clock
 MIN_CONSTANT_TIMESTAMPS = 10
 
@@ -59,7 +59,7 @@ class Recording:
     # of the last autopilot message before the frame
     received_s: Array
     # Map from receive time to boot clock
-    boot_of_receipt: ClockLine
+    receipt_to_boot: ClockLine
     # Boot time at the start of the session, which is time zero of the flight
     zero_s: float
     duration_s: float
@@ -146,11 +146,11 @@ class Recording:
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
         """Return the receive time since boot (s) of frames, minus the minimum link delay."""
-        return self.boot_of_receipt.at(self.received_s[rows])
+        return self.receipt_to_boot.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of autopilot messages, else their receive time."""
-        if not self.boot_of_receipt.pairs:  # no message contains the boot clock
+        if not self.receipt_to_boot.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
@@ -216,7 +216,7 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
         name = message_name(message_id)
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
             field_name, unit_s = "time_boot_ms", 1e-3
-        elif name in STAMPED_BY_BOOT_CLOCK:
+        elif name in BOOT_CLOCK_MESSAGES:
             field_name, unit_s = "time_usec", 1e-6
         else:
             continue
@@ -243,38 +243,38 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     notes: list[str] = []
     rows, boot_s = _read_boot_times(frames, address)
     session = slice(0, len(frames))
-    restarts = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
+    restart_rows = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
     # A single late or early packet is not a restart: the packets before and after have to agree
-    boot_before_s = boot_s[np.maximum(restarts - 1 - RESTART_CHECK_MESSAGES, 0)]
-    boot_after_s = boot_s[np.minimum(restarts + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
-    restarts = restarts[
-        boot_after_s < np.minimum(boot_before_s, boot_s[restarts - 1]) - MIN_RESTART_STEP_S
+    boot_before_s = boot_s[np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)]
+    boot_after_s = boot_s[np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
+    restart_rows = restart_rows[
+        boot_after_s < np.minimum(boot_before_s, boot_s[restart_rows - 1]) - MIN_RESTART_STEP_S
     ]
-    if len(restarts):
-        row_limits = [0, *restarts.tolist(), len(rows)]
-        index = int(np.argmax(np.diff(row_limits)))
-        used = slice(row_limits[index], row_limits[index + 1])
-        used_fraction = (used.stop - used.start) / len(rows)
-        rows, boot_s = rows[used], boot_s[used]
+    if len(restart_rows):
+        row_limits = [0, *restart_rows.tolist(), len(rows)]
+        session_index = int(np.argmax(np.diff(row_limits)))
+        session_rows = slice(row_limits[session_index], row_limits[session_index + 1])
+        used_fraction = (session_rows.stop - session_rows.start) / len(rows)
+        rows, boot_s = rows[session_rows], boot_s[session_rows]
         session = slice(
-            int(rows[0]) if index else 0,
-            int(rows[-1]) + 1 if index < len(restarts) else len(frames),
+            int(rows[0]) if session_index else 0,
+            int(rows[-1]) + 1 if session_index < len(restart_rows) else len(frames),
         )
         notes.append(
-            f"restarts of the boot clock: {len(restarts)}; only session {index + 1} is analysed, "
-            f"from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot ({used_fraction:.0%} of the "
-            "data)"
+            f"restarts of the boot clock: {len(restart_rows)}; only session {session_index + 1} "
+            f"is analysed, from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
+            f"({used_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
     rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
-    line = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    receipt_to_boot = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     received_s = np.zeros(len(frames))
     if frames.received_us is not None:
         received_s = (frames.received_us - frames.received_us[0]) * 1e-6
         if len(rows):
-            line = fit_least_delay(boot_s, received_s[rows]).inverse()
+            receipt_to_boot = fit_least_delay(boot_s, received_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times; the last boot time before each frame is used instead
         previous_row = np.clip(
@@ -283,22 +283,23 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         received_s = boot_s[previous_row]
     else:
         notes.append("no message in the stream contains a time")
-    receipt_reversals = int(np.count_nonzero(np.diff(received_s) < 0.0))
+    receipt_reversal_count = int(np.count_nonzero(np.diff(received_s) < 0.0))
     if unknown_count := frames.unknown_frame_count:
         notes.append(f"number of ignored frames with unknown message type: {unknown_count}")
-    if damaged_count := frames.damaged_receive_times:
+    if damaged_count := frames.damaged_receive_time_count:
         notes.append(f"number of damaged receive times that were interpolated: {damaged_count}")
-    if receipt_reversals:
-        notes.append(f"number of backward jumps of the receive time: {receipt_reversals}")
-    lost_fraction = frames.bad_bytes / len(frames.content)
+    if receipt_reversal_count:
+        notes.append(f"number of backward jumps of the receive time: {receipt_reversal_count}")
+    lost_fraction = frames.bad_byte_count / len(frames.content)
     lost_text = (
-        f"{frames.bad_bytes:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink frame"
+        f"{frames.bad_byte_count:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink "
+        "frame"
     )
     # Incomplete frames at the beginning and end of the file do not count as damage
-    bytes_inside = frames.bad_bytes - 2 * MAX_FRAME_BYTES
-    is_damaged = bytes_inside > MAX_LOST_FRACTION * len(frames.content)
+    bytes_inside = frames.bad_byte_count - 2 * MAX_FRAME_BYTES
+    is_damaged = bytes_inside > MAX_STRAY_BYTE_FRACTION * len(frames.content)
     damage = (f"the file is damaged: {lost_text}",) if is_damaged else ()
-    if frames.bad_bytes and not is_damaged:
+    if frames.bad_byte_count and not is_damaged:
         notes.append(lost_text)
     # Without a boot clock, flight time is receive time
     zero_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[[0, -1]].tolist()
@@ -307,13 +308,13 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         address,
         session,
         received_s,
-        line,
+        receipt_to_boot,
         zero_s,
         end_s - zero_s,
         notes,
         damage,
-        len(restarts) or None,
-        receipt_reversals or None,
+        len(restart_rows) or None,
+        receipt_reversal_count or None,
     )
 
 

@@ -26,8 +26,8 @@ MAX_SENDERS = 32
 MAX_LOST_FRACTION = 0.9
 # Maximum lateness (sequence numbers) of a message that was received over a slower link
 MAX_LATE_MESSAGES = 16
-# Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: with a larger
-# one they are from another clock
+# Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
+# difference shows another clock
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
@@ -66,26 +66,32 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     """
     counts = dict(_count_frames(frames))
     vehicles = _read_vehicle_types(frames)
-    vehicle_addresses = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
+    vehicle_addresses = [
+        address for address in counts if address in vehicles and _is_vehicle(*vehicles[address])
+    ]
     rows = np.concatenate([frames.rows(name) for name in messages.AUTOPILOT_MESSAGES])
     autopilot_counts = dict(_count_frames(frames, rows))
     # Companion computers may send autopilot heartbeats, so senders of messages that only autopilots
     # send are preferred. Without a heartbeat, these messages or the component id identify the
     # autopilot
     candidates = (
-        [s for s in vehicle_addresses if s in autopilot_counts]
-        or [s for s in autopilot_counts if s not in vehicles]
+        [address for address in vehicle_addresses if address in autopilot_counts]
+        or [address for address in autopilot_counts if address not in vehicles]
         or vehicle_addresses
     )
-    candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT_ID]
+    candidates = candidates or [
+        address for address in counts if address[1] == messages.AUTOPILOT_COMPONENT_ID
+    ]
     # The recording may contain no message that the autopilot sent
-    candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT_ID) for s in counts]
+    candidates = candidates or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in counts]
     if system is not None:
         candidates = [
             address for address in {*vehicle_addresses, *candidates} if address[0] == system
         ]
         if not candidates:
-            ids = ", ".join(map(str, sorted({s[0] for s in vehicle_addresses}))) or "none"
+            ids = (
+                ", ".join(map(str, sorted({address[0] for address in vehicle_addresses}))) or "none"
+            )
             raise SettingsError(
                 f"{frames.name}: no autopilot has MAVLink system id {system}. System ids of "
                 f"autopilots in this file: {ids}."
@@ -100,18 +106,22 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
     frames = recording.frames
     own_address = recording.address
     other_vehicles = {
-        s[0]
-        for s, vehicle_type in _read_vehicle_types(frames).items()
+        address[0]
+        for address, vehicle_type in _read_vehicle_types(frames).items()
         if _is_vehicle(*vehicle_type)
     } - {own_address[0]}
     counts = _count_frames(frames, recording.rows_of_all_senders(message))
-    return [s for s, _ in counts if s != own_address and s[0] not in other_vehicles][:MAX_SENDERS]
+    return [
+        address
+        for address, _ in counts
+        if address != own_address and address[0] not in other_vehicles
+    ][:MAX_SENDERS]
 
 
 def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
     """Map the clock of every sender of an external position to the boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
-    senders = {s for message in message_names for s in senders_of(recording, message)}
+    senders = {address for message in message_names for address in senders_of(recording, message)}
     unix_line = map_boot_to_unix(recording)
     return {sender: _map_sender_clock(recording, sender, unix_line) for sender in sorted(senders)}
 
@@ -155,7 +165,7 @@ def _map_sender_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
         np.concatenate(received_s),
-        recording.boot_of_receipt,
+        recording.receipt_to_boot,
         (request_s[is_reply], reply_s[is_reply]),
         (answered_request_s[is_answer], answer_s[is_answer]),
         unix_line,
@@ -177,7 +187,7 @@ def clock_maps(
     """Return the maps from sender clocks and receive time to the boot clock."""
     clocks = [mapping.description for mapping in clock_mappings.values()]
     received_us = recording.frames.received_us
-    line = recording.boot_of_receipt
+    line = recording.receipt_to_boot
     if received_us is not None and line.pairs:
         note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
@@ -203,7 +213,7 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
     vehicles = _read_vehicle_types(recording.frames)
-    described = []
+    sender_descriptions = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
         description = "sender without heartbeat"
         if address in vehicles:
@@ -213,8 +223,8 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
         lost_fraction = _lost_fraction(frames, address)
         is_chosen = address == recording.address
-        described.append(Sender(*address, description, count, lost_fraction, is_chosen))
-    return tuple(described)
+        sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_chosen))
+    return tuple(sender_descriptions)
 
 
 def _lost_fraction(frames: Frames, address: Address) -> float | None:

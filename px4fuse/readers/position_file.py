@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, IntArray, median_interval
-from px4fuse.core.reading import read_bytes_limited, split_part
+from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
-from px4fuse.readers.common import find_invalid, rounding_step
+from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.formats import refuse_foreign_format
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
@@ -46,16 +46,16 @@ SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
 # Maximum number of tags in a column: a column with more values contains a running number
 MAX_TAGS = 100
-MIN_ROWS = 3
+MIN_USABLE_ROWS = 3
 # Minimum fraction of rows that agree with the assumed meaning of a column
-MIN_USABLE_SHARE = 0.9
+MIN_USABLE_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible units of positions and trajectories, and range of their median interval (s): key frames
-# may have minutes between them
+# Plausible time units of positions, and minimum and maximum of their median interval (s)
 POSITION_TIMES = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
+# Plausible time units of trajectories, and minimum and maximum of their median interval (s)
 TRAJECTORY_TIMES = ("s", "ns"), (1e-3, 1e3)
 # Maximum median interval (s) of UNIX times: boot times in µs may be equally large numbers, but as
 # UNIX times they would have larger intervals
@@ -88,7 +88,7 @@ class PositionRecording:
     dropped: int = 0
     # Factor that was applied to the positions
     metres_per_unit: float = 1.0
-    # Reason for each row that is not a measurement, see :func:`find_invalid`
+    # Reason for each row that is not a measurement, see :func:`find_invalid_rows`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Rounding step of the coarsest horizontal coordinate; 0 if there is none
     step_m: float = 0.0
@@ -139,34 +139,34 @@ def read_position_file(
         An option has an invalid value or names a column that is not in the file.
     """
     _check_options(columns, time_unit, length_unit)
-    path, part = split_part(str(path))
-    table, sha256, size_bytes = _open_table(path, columns, body or part)
+    path, body_in_path = split_path_and_part(str(path))
+    table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
     quaternion_columns = find_quaternion(table.names)
-    numbers, has_zone = _read_numbers(
-        table, meanings, chosen_columns, quaternion_columns, body or part
+    numbers, has_time_zone = _read_numbers(
+        table, meanings, chosen_columns, quaternion_columns, body or body_in_path
     )
     row_count = len(numbers)
-    time, position, sigma, frame, time_text = _choose_columns(
+    time_column, position, sigma, frame, time_text = _choose_columns(
         table, meanings, chosen_columns, numbers
     )
-    axes = [index for index in position if index is not None]
+    position_columns = [index for index in position if index is not None]
     # pandas reads numbers such as 1e999 as infinite
-    has_time = np.isfinite(numbers[time])
-    is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
+    has_time = np.isfinite(numbers[time_column])
+    is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
             f"number of dropped rows without valid time or position: {unusable_count}"
             f"{table.first_line(numbers.index[~is_usable])}"
         )
-    empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
+    empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
-    times = numbers[time].to_numpy()
-    name_unit = meanings[time].unit if meanings[time].unit in TIME_UNITS else ""
-    units, intervals_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
-    unit, unit_text = _time_unit(times, name_unit, time_unit, units, intervals_s)
+    times = numbers[time_column].to_numpy()
+    name_unit = meanings[time_column].unit if meanings[time_column].unit in TIME_UNITS else ""
+    units, interval_range_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
+    unit, unit_text = _time_unit(times, name_unit, time_unit, units, interval_range_s)
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
     if table.rate_hz is not None:
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
@@ -178,38 +178,52 @@ def read_position_file(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
             f"{dropped}"
         )
-    is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_SHARE * row_count
-    if is_not_time or len(kept_rows) < MIN_ROWS:
+    is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
+    if is_not_time or len(kept_rows) < MIN_USABLE_ROWS:
         raise LogError(
-            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_ROWS}"
-            f"{''.join('; ' + note for note in notes)}",
+            "; ".join(
+                (
+                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
+                    f"{MIN_USABLE_ROWS}",
+                    *notes,
+                )
+            ),
             f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
     median_interval_s = median_interval(numbers.index)
-    if not intervals_s[0] <= median_interval_s <= intervals_s[1]:
+    if not interval_range_s[0] <= median_interval_s <= interval_range_s[1]:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
     scale_by_column, length_unit_text = _length_units(
-        numbers, axes, meanings, length_unit, np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
+        numbers,
+        position_columns,
+        meanings,
+        length_unit,
+        np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
         for name, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
-    reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
+    invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
-        reason[:] = ""
-    invalid = reason[reason != ""], pd.Series("NaN", empty_times / units_per_second)
-    quaternions = numbers.loc[reason == "", quaternion_columns].to_numpy()
-    samples = samples[reason == ""]
+        invalid_reasons[:] = ""
+    invalid_parts = (
+        invalid_reasons[invalid_reasons != ""],
+        pd.Series("NaN", empty_times / units_per_second),
+    )
+    quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
+    samples = samples[invalid_reasons == ""]
     notes += _drop_invalid_sigmas(samples)
-    is_unix = has_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
+    is_unix = has_time_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (len(axes) < 3)
+    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (
+        len(position_columns) < 3
+    )
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -228,8 +242,8 @@ def read_position_file(
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
-        metres_per_unit=scale_by_column[axes[0]],
-        invalid=pd.concat(invalid).sort_index(),
+        metres_per_unit=scale_by_column[position_columns[0]],
+        invalid=pd.concat(invalid_parts).sort_index(),
         format=table.format,
         row_count=row_count,
         quaternions=quaternions if quaternion_columns else None,
@@ -294,12 +308,12 @@ def _read_numbers(
     is_comma_decimal = table.separator != ","
     # without rows, apply returns objects
     numbers = texts.apply(_to_numbers, is_comma_decimal=is_comma_decimal).astype(np.float64)
-    has_zone = True
+    has_time_zone = True
     for index in chosen_columns[:1] or [i for i in named_columns if meanings[i].kind == "time"]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
-            numbers[index], has_zone = _read_dates(texts[index])
+            numbers[index], has_time_zone = _read_dates(texts[index])
             meanings[index] = replace(meanings[index], unit="s")
-    return numbers, has_zone
+    return numbers, has_time_zone
 
 
 def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
@@ -334,7 +348,7 @@ def _select_body(
             tags = texts[index].dropna().unique().tolist()
             if 1 < len(tags) <= MAX_TAGS or (tags and body is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body)]
-    if body is not None and not table.is_one_body:
+    if body is not None and not table.is_chosen_body:
         raise LogError(
             f"{table.file_name} contains one body, without a name", "Omit the name of the body."
         )
@@ -396,7 +410,7 @@ def _choose_columns(
         )
         time_text = table.label(time)
         for index in other_times:
-            are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_SHARE
+            are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time] += numbers[index] * 1e-9
                 other_times = [column for column in other_times if column != index]
@@ -417,17 +431,17 @@ def _choose_columns(
 def _time_unit(
     times: Array,
     name_unit: str,
-    option: str | None,
+    given_unit: str | None,
     units: Container[str],
-    intervals_s: tuple[float, float],
+    interval_range_s: tuple[float, float],
 ) -> tuple[str, str]:
     """Return the unit of the time column, and the reason for this unit.
 
-    ``units`` and ``intervals_s`` are plausible units and median intervals of times that are not
+    ``units`` and ``interval_range_s`` are plausible units and median intervals of times other than
     UNIX times.
     """
-    if option is not None:
-        return option, "the unit was given with --position-time-unit"
+    if given_unit is not None:
+        return given_unit, "the unit was given with --position-time-unit"
     median = float(np.median(times)) if len(times) else 0.0
     if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
         return name_unit, "the column name contains the unit"
@@ -438,25 +452,25 @@ def _time_unit(
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, "with this unit the times are UNIX times"
-        if unit in units and intervals_s[0] <= median_step * scale <= intervals_s[1]:
+        if unit in units and interval_range_s[0] <= median_step * scale <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
             "px4fuse assumes this unit, because no unit gives a plausible UWB rate; set another "
             "unit with --position-time-unit"
         )
-    unit, *others = plausible_units
-    reason = f"with this unit the median interval is {median_step * TIME_UNITS[unit]:.3g} s"
-    if others:
-        reason += f"; if the unit is {others[0]}, give --position-time-unit"
-    return unit, reason
+    unit, *other_units = plausible_units
+    reasons = [f"with this unit the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
+    if other_units:
+        reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
+    return unit, "; ".join(reasons)
 
 
 def _length_units(
     numbers: pd.DataFrame,
-    axes: list[int],
+    position_columns: list[int],
     meanings: Sequence[ColumnMeaning],
-    option: str | None,
+    given_unit: str | None,
     max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
     """Return metres per unit of each column, and a text with the unit of the positions."""
@@ -466,15 +480,15 @@ def _length_units(
         if meaning.unit in LENGTH_UNITS
     }
     # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
-    extents = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
+    extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
     reason = "px4fuse assumes this unit, because the column names contain no unit"
-    if option is not None:
-        unit = option
+    if given_unit is not None:
+        unit = given_unit
         name_units = {}
         reason = "the unit was given with --position-unit"
-    elif axis_units := [name_units[index] for index in axes if index in name_units]:
+    elif axis_units := [name_units[index] for index in position_columns if index in name_units]:
         unit = axis_units[0]
         reason = "the column names contain the unit"
     elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
@@ -490,9 +504,9 @@ def _length_units(
         )
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
-    span_m = max(float(extents[index]) * scale_by_column[index] for index in axes)
-    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in axes))
+    extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
+    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
     return (
         scale_by_column,
-        f"{used_units} ({reason}); 90 % of the positions are within {span_m:.3g} m",
+        f"{used_units} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
     )

@@ -5,14 +5,14 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Column indices of x, y and z; None without height
-Position = tuple[int, int, int | None]
-_TABLE = table(__file__, "position_names.toml", dict[str, dict[str, str]])
+PositionColumns = tuple[int, int, int | None]
+_TABLE = read_toml(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
     {
         word: meaning
@@ -73,8 +73,12 @@ def read_column_name(name: str) -> ColumnMeaning:
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
     if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
-        is_kind = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
-        return ColumnMeaning("time", TIME_KINDS[is_kind.index(True)], unit)
+        is_time_kind = [
+            bool(word_set & _ROLES["measured"]),
+            not word_set & _ROLES["recorded"],
+            True,
+        ]
+        return ColumnMeaning("time", TIME_KINDS[is_time_kind.index(True)], unit)
     if word_set and word_set <= _ROLES["tag"]:
         return ColumnMeaning("tag")
     position_words = _ROLES["sigma"] | _ROLES["context"]
@@ -93,18 +97,18 @@ def read_column_name(name: str) -> ColumnMeaning:
     )
 
 
-def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
+def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, PositionColumns] | None:
     """Return frame and column indices of the position.
 
     A position with height is preferred to a position without height. Return None if the file has no
     position.
     """
-    groups: dict[str, dict[str, int]] = {}
+    columns_by_group: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
         if column.kind == "position":
-            groups.setdefault(column.group, {}).setdefault(column.key, index)
+            columns_by_group.setdefault(column.group, {}).setdefault(column.key, index)
     for axis_count in (3, 2):
-        for axes in groups.values():
+        for axes in columns_by_group.values():
             for frame, names in () if "w" in axes else _FRAMES:  # x, y, z, w is a quaternion
                 if {*names[:axis_count]} <= axes.keys():
                     return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
@@ -113,13 +117,13 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
     """Return the index of the sigma column of each axis, or of the sigma column for all axes."""
-    sigmas: dict[str, int] = {}
+    sigma_columns: dict[str, int] = {}
     for index, meaning in enumerate(meanings):
         if meaning.kind == "sigma":
-            sigmas.setdefault(meaning.key, index)
+            sigma_columns.setdefault(meaning.key, index)
     axes = next(axes for name, axes in _FRAMES if name == frame)
     return tuple(
-        sigmas.get(axis, sigmas.get(letter, sigmas.get("")))
+        sigma_columns.get(axis, sigma_columns.get(letter, sigma_columns.get("")))
         for axis, letter in zip(axes, "xyz", strict=True)
     )
 

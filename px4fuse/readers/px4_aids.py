@@ -23,8 +23,9 @@ from px4fuse.readers.ulog_topics import Topics
 # Maximum time difference (s) between an innovation and the logged variance S: the default logging
 # profile logs both topics every 0.5 s, and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
-# Fields of estimator_aid_src topics that are read if they are logged, by column name and aid
+# Field of estimator_aid_src topics with the time of the last fusion, by column name
 LAST_FUSED = {"last_fused_us": "time_last_fuse"}
+# Fields of estimator_aid_src topics that are read if they are logged, by aid and column name
 OPTIONAL_FIELDS = {
     "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
     "ev_pos": LAST_FUSED,
@@ -38,17 +39,19 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     A topic ``estimator_aid_src_...`` contains each fusion attempt. Older topics contain all aiding
     sources, and repeat each value until the next fusion.
     """
-    logs = {}
+    log_by_aid = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled_aids.get(name)
-        log = _read_aid_topic(topics, aid, aid_enabled)
+        aid_log = _read_aid_topic(topics, aid, aid_enabled)
         # While EKF2 does not fuse an aiding source, the older topics contain its old values, or
         # values of other sources
-        if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
-            log = _read_common_topics(topics, aid, aid_enabled)
-        if log is not None:
-            logs[name] = log
-    return logs
+        if aid_log is None and (
+            name.startswith("ev_") if aid_enabled is None else aid_enabled.any()
+        ):
+            aid_log = _read_common_topics(topics, aid, aid_enabled)
+        if aid_log is not None:
+            log_by_aid[name] = aid_log
+    return log_by_aid
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
@@ -79,13 +82,13 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    count = len(aid.axes)
-    elements = [""] if count == 1 else [f"[{number}]" for number in range(count)]
+    axis_count = len(aid.axes)
+    elements = [""] if axis_count == 1 else [f"[{number}]" for number in range(axis_count)]
     columns = {
         f"{column_prefix}_{axis}": field_name + element
         for axis, element in zip(aid.axes, elements, strict=True)
         for column_prefix, field_name in (
-            *((("observation", "observation"),) if aid.name in px4.WITH_OBSERVATION else ()),
+            *((("observation", "observation"),) if aid.name in px4.AIDS_WITH_OBSERVATION else ()),
             ("innovation", "innovation"),
             ("variance", "innovation_variance"),
             ("noise", "observation_variance"),
@@ -99,7 +102,7 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
     samples = topics.primary_samples(layout).dropna()
     if "last_fused_us" in samples:
         samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.zero_us) * 1e-6
-    if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
+    if enabled is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
         samples["fused"] = step_values_at(enabled, samples.index)
     return _make_aid_log(topics, (layout.topic,), aid, samples, enabled)
 
@@ -112,31 +115,33 @@ def _read_common_topics(
     )
     layouts = []
     if aid.fields and not is_in_gauss:
-        pairs = zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
-        layouts.append([Layout(t, _columns_by_axis(name, aid, aid.fields)) for t, name in pairs])
+        pairs = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
+        layouts.append(
+            [Layout(topic, _columns_by_axis(name, aid, aid.fields)) for topic, name in pairs]
+        )
     if aid.old_fields:
         fields = _columns_by_axis("innovation", aid, aid.old_fields)
         variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
         fields |= _columns_by_axis("variance", aid, variance_fields)
-        layouts.append([Layout(px4.OLD_INNOVATIONS, fields)] * 2)
-    for values, variances in layouts:
-        innovations = topics.primary_samples(values)
-        samples = topics.primary_samples(values, select=_drop_repeats)
-        unknown_fusion_s = _unknown_fusion_times(
+        layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
+    for value_layout, variance_layout in layouts:
+        innovations = topics.primary_samples(value_layout)
+        samples = topics.primary_samples(value_layout, select=_drop_repeats)
+        unknown_fusion_times_s = _unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
-            topics.primary_samples(variances)[f"variance_{aid.axes[0]}"],
+            topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
-        if variances is not values:
+        if variance_layout is not value_layout:
             # Nearest rows, because the logger decimates each topic separately, and S changes slowly
-            variance_samples = topics.primary_samples(variances).dropna()
+            variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, JOIN_TOLERANCE_S)
         excluded_count = len(samples) - len(samples := samples.dropna())
         if enabled is not None:
             samples = samples[step_values_at(enabled, samples.index) > 0.0]
-        used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
-        log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
-        if log is not None:
-            return replace(log, unknown_fusion_s=unknown_fusion_s)
+        used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
+        aid_log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
+        if aid_log is not None:
+            return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
     return None
 
 
@@ -173,7 +178,9 @@ def _make_aid_log(
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:
         return None
-    negated = {column: -samples[column] for column in _columns_by_axis("innovation", aid, aid.axes)}
+    negated_innovations = {
+        column: -samples[column] for column in _columns_by_axis("innovation", aid, aid.axes)
+    }
     parameters = aid.logged_parameters(topics.ekf2_parameters)
-    samples = samples.assign(**negated)
+    samples = samples.assign(**negated_innovations)
     return AidLog(used_topics, aid.axes, samples, enabled, parameters, excluded_count)

@@ -40,9 +40,9 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance from n + 0.5 of the ratio of prediction interval to IMU interval, for which EKF2
+# Maximum distance of the ratio of prediction interval to IMU interval from n + 0.5, at which EKF2
 # may round up or down
-MAX_HALF_DISTANCE = 0.05
+MAX_HALF_RATIO_DISTANCE = 0.05
 # Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
 # between them
 MAX_FLOW_INTERVAL_S = 0.5
@@ -58,7 +58,7 @@ OTHER_HORIZONTAL_AIDS = (
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    f"{px4.DEFAULT_PROFILE} Wait until EKF2 has started.",
+    f"{px4.DEFAULT_PROFILE_REMEDY} Wait until EKF2 has started.",
 )
 _RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
@@ -81,7 +81,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     local_position = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
-        return Unavailable("EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE)
+        return Unavailable(
+            "EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE_REMEDY
+        )
     state = local_position[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
@@ -114,7 +116,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     failed_checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
     if len(failed_checks):
         states["failed_checks"] = failed_checks
-    step_s = _step_s(topics)
+    step_s = _prediction_interval_s(topics)
     delayed_state = variance = _read_delayed_state(topics, step_s)
     if isinstance(delayed_state, pd.DataFrame):
         variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -135,8 +137,8 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         notes=tuple(notes),
         accelerometer_bias=_accelerometer_bias(topics, delayed_state),
         step_s=step_s,
-        horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, delayed_state, local_position, enabled_aids, step_s),
+        horizon_s=_horizon_delay_s(topics, step_s),
+        record=_read_fusion_record(topics, delayed_state, local_position, enabled_aids, step_s),
         aids=aids,
         states=states,
         parameters=topics.ekf2_parameters,
@@ -150,12 +152,12 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
     The topic is an empty string if it is not logged. The number is 0 if the array lengths are
     unknown.
     """
-    for topic in px4.ESTIMATOR_STATES:
+    for topic in px4.STATE_VECTOR_TOPICS:
         for table in topics.tables_of(topic)[:1]:
-            states = sum(name.startswith("states[") for name in table)
-            variances = sum(name.startswith("covariances[") for name in table)
-            if variances:
-                return topic, px4.ATTITUDE_VARIANCES.get((states, variances), 0)
+            state_count = sum(name.startswith("states[") for name in table)
+            variance_count = sum(name.startswith("covariances[") for name in table)
+            if variance_count:
+                return topic, px4.ATTITUDE_VARIANCE_COUNTS.get((state_count, variance_count), 0)
     return "", 0
 
 
@@ -165,23 +167,23 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
     increments per prediction.
     """
-    topic, attitude = _state_vector(topics)
+    topic, attitude_variance_count = _state_vector(topics)
     if not topic:
         return VARIANCES_NOT_LOGGED
-    if not attitude:
+    if not attitude_variance_count:
         return Unavailable(
             "EKF2 variances",
             f"{topic} has arrays of unknown length",
             "Report the PX4 version in an issue of px4fuse.",
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
-    variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude)]
+    variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude_variance_count)]
     layout = Layout(topic, {name: name for name in states + variances})
     samples = topics.primary_samples(layout).dropna()
     samples = samples[(samples[variances] >= 0.0).all(axis=1)]
     state = samples[states].to_numpy(copy=True)
     variance = samples[variances].to_numpy(copy=True)
-    if attitude == px4.QUATERNION_FILTER:
+    if attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
         variance[:, 9:15] /= step_s**2
@@ -194,7 +196,7 @@ def configured_step_s(topics: Topics) -> float:
     return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
 
 
-def _step_s(topics: Topics) -> float:
+def _prediction_interval_s(topics: Topics) -> float:
     """Return the prediction interval (s), a whole number of IMU intervals (ImuDownSampler.cpp)."""
     configured_s = configured_step_s(topics)
     imu_s = topics.read(px4.IMU).index.to_numpy()
@@ -229,18 +231,19 @@ def samples_per_step(
     """
     ratio_plus_half = configured_step_s / imu_interval_s + 0.5
     # The added 1e-6 makes the result independent of the rounding of timestamps to µs
-    samples = max(int(ratio_plus_half + 1e-6), 1)
+    sample_count = max(int(ratio_plus_half + 1e-6), 1)
     sample_differences = np.diff(np.asarray(step_ends, dtype=float))
     if (
-        samples > 1
-        and abs(ratio_plus_half - samples) < MAX_HALF_DISTANCE
+        sample_count > 1
+        and abs(ratio_plus_half - sample_count) < MAX_HALF_RATIO_DISTANCE
         and len(sample_differences)
     ):
         fits_larger, fits_smaller = (
-            np.mean(sample_differences % count == 0.0) > 0.9 for count in (samples, samples - 1)
+            np.mean(sample_differences % step_sample_count == 0.0) > 0.9
+            for step_sample_count in (sample_count, sample_count - 1)
         )
-        return samples - int(fits_smaller and not fits_larger)
-    return samples
+        return sample_count - int(fits_smaller and not fits_larger)
+    return sample_count
 
 
 def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> TableOrUnavailable:
@@ -251,7 +254,7 @@ def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> Ta
     return delayed_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
-def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
+def _horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
     """Return the median delay (s) from EKF2's fusion horizon to publication.
 
     Before v1.13, timestamp_sample is the time of the newest IMU sample. The delay is then below one
@@ -281,7 +284,7 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
-            px4.DEFAULT_PROFILE,
+            px4.DEFAULT_PROFILE_REMEDY,
         )
     flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
@@ -296,20 +299,22 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
 def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
     """Read the resets of the published state from its counters (uint8, wrapping) and deltas."""
     resets = []
-    for quantity, counter, deltas in _RESET_FIELDS:
-        if counter not in local_samples:
+    for quantity, counter_field, delta_fields in _RESET_FIELDS:
+        if counter_field not in local_samples:
             continue
-        for row in (np.flatnonzero(np.diff(local_samples[counter].to_numpy()) != 0) + 1).tolist():
+        for row in (
+            np.flatnonzero(np.diff(local_samples[counter_field].to_numpy()) != 0) + 1
+        ).tolist():
             north, east, down = (
                 float(local_samples[name].iloc[row]) if name in local_samples else 0.0
-                for name in deltas
+                for name in delta_fields
             )
             if all(np.isfinite([north, east, down])):
                 resets.append(Reset(float(local_samples.index[row]), quantity, (north, east, down)))
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
-def _read_record(
+def _read_fusion_record(
     topics: Topics,
     delayed_state: TableOrUnavailable,
     local_samples: pd.DataFrame,
@@ -320,11 +325,11 @@ def _read_record(
 
     ``local_samples`` are the samples of EKF2's published local position.
     """
-    topic, attitude = _state_vector(topics)
-    if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed_state, Unavailable):
+    topic, attitude_variance_count = _state_vector(topics)
+    if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(delayed_state, Unavailable):
         return flight.RECORD_NOT_LOGGED
-    norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
-    usable_state = delayed_state[np.abs(norm - 1.0) < 0.01].copy()
+    quaternion_norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
+    usable_state = delayed_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
     horizontal_columns = Columns.POSITION[:2]
@@ -339,21 +344,21 @@ def _read_record(
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
-        per_step_biases=attitude == px4.QUATERNION_FILTER,
-        other_aiding=tuple(
+        stores_bias_increments=attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT,
+        other_horizontal_aids=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS
             if name in enabled_aids and enabled_aids[name].any()
         ),
         vision_age_s=age_s[~age_s.index.duplicated()],
-        field_gauss=_read_field(topics, step_s),
-        flow=_read_flow(topics, enabled_aids),
+        field_gauss=_read_magnetic_field(topics, step_s),
+        flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=_last_finite_value(local_samples, "ref_lat", np.nan),
         altitude_m=altitude_m,
         states={name: enabled_aids[name] for name in DISTURBANCES if name in enabled_aids},
         height_bias={
             name: topics.primary_samples(layout).dropna()
-            for name, layout in px4.HEIGHT_BIAS.items()
+            for name, layout in px4.HEIGHT_BIAS_LAYOUTS.items()
             if topics.find(layout) is not None
         },
     )
@@ -364,12 +369,12 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
     return float(finite_values[-1]) if len(finite_values) else default
 
 
-def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
+def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the magnetic field from the magnetometer or from EKF2's observations.
 
     A topic with all samples is preferred, else one with EKF2's low-pass filtered innovations.
     """
-    candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETOMETER]
+    candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS]
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
     shift_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     candidates[1] = candidates[1].set_axis(candidates[1].index + shift_s)
@@ -385,7 +390,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
+def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     """Undo EKF2's low-pass filter of optical flow; return the mean of each interval."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()

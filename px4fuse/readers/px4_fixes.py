@@ -23,7 +23,7 @@ FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 MAX_MULTIPLE_ERROR_S = 0.006
 # Minimum number of logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals of n, and of n + 1, receiver intervals for an estimate of the
+# Minimum number of logged intervals of n receiver intervals, and also of n + 1, to estimate the
 # receiver interval
 MIN_REPEATED_INTERVALS = 3
 # Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
@@ -87,7 +87,7 @@ def reconstruct_fixes(
     gnss_innovations = with_gnss_innovations(ekf2).innovations
     north, east = gnss_innovations["north"], gnss_innovations["east"]
     fix_s = fixes.index.to_numpy()
-    interval_s = _interval_s(fix_s)
+    interval_s = _receiver_interval_s(fix_s)
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes
     # EKF2 fuses a fix older than the fusion horizon at the horizon (RingBuffer.h)
@@ -131,7 +131,7 @@ def reconstruct_fixes(
     )
 
 
-def _interval_s(times: Array) -> float | None:
+def _receiver_interval_s(times: Array) -> float | None:
     """Return the longest interval (s) of which all logged intervals are multiples.
 
     Return None if all logged intervals are equal, because the multiple is then unknown.

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, TABLES
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETER_TABLES
 from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
 Innovations = dict[AxisName, TableOrUnavailable]
@@ -29,7 +29,9 @@ class Ekf2Source:
     height: str = ""
 
 
-VISION, GNSS = (msgspec.convert(TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss"))
+VISION, GNSS = (
+    msgspec.convert(PARAMETER_TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss")
+)
 GNSS_AND_BAROMETER = replace(
     GNSS,
     vertical=BAROMETER.name,
@@ -42,29 +44,32 @@ GNSS_AND_BAROMETER = replace(
 )
 
 
-def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
+def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     """Return True if EKF2 fused the aiding source at any time.
 
     If the log contains no fusion flags, return True if EKF2 enabled the aiding source.
     """
     if isinstance(ekf2, Unavailable):
         return False
-    log = ekf2.aids.get(aid)
-    if log is not None and "fused" in log.samples:
-        return bool(log.samples["fused"].any())
-    if log is not None and log.enabled is not None:
+    aid_log = ekf2.aids.get(aid)
+    if aid_log is not None and "fused" in aid_log.samples:
+        return bool(aid_log.samples["fused"].any())
+    if aid_log is not None and aid_log.enabled is not None:
         return True
     # without fusion flags, a valid global position shows that EKF2 fused GNSS
     has_flags = "tilt_align" in ekf2.states
-    is_global = ekf2.states.get("xy_global")
+    global_flags = ekf2.states.get("xy_global")
     return (
-        aid == GNSS_POS.name and not has_flags and is_global is not None and bool(is_global.any())
+        aid == GNSS_POS.name
+        and not has_flags
+        and global_flags is not None
+        and bool(global_flags.any())
     )
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     """Replace the innovations of external vision by the GNSS innovations."""
-    enabled = {
+    enabled_flags = {
         group: ekf2.states[name]
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if name in ekf2.states
@@ -72,13 +77,13 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     fusion_flags: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log
     )
-    if enabled:
+    if enabled_flags:
         columns = ["horizontal", "vertical", "yaw"]
         fusion_flags = (
-            pd.DataFrame(enabled).ffill().bfill().reindex(columns=columns, fill_value=0.0)
+            pd.DataFrame(enabled_flags).ffill().bfill().reindex(columns=columns, fill_value=0.0)
         )
-    log = ekf2.aids.get("gnss_pos")
-    parameters = {} if log is None else log.parameters
+    aid_log = ekf2.aids.get("gnss_pos")
+    parameters = {} if aid_log is None else aid_log.parameters
     gate = parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
@@ -112,13 +117,13 @@ def innovations_by_axis(
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
         sensor = (axis == "down" and source.height) or source.name
-        log = aids.get(source.vertical if axis == "down" else source.horizontal)
-        axis_innovations = None if log is None else innovations_along(log, axis, gate)
+        aid_log = aids.get(source.vertical if axis == "down" else source.horizontal)
+        axis_innovations = None if aid_log is None else innovations_along(aid_log, axis, gate)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused {sensor} for {quantity} in this log"
             remedy = source.remedies[group]
-        elif log is None or axis_innovations is None or axis_innovations.empty:
+        elif aid_log is None or axis_innovations is None or axis_innovations.empty:
             reason = (
                 f"while {sensor} was fused, the log has no usable sample of "
                 f"estimator_aid_src_{source.horizontal}, estimator_aid_src_{source.vertical}, "
@@ -127,7 +132,7 @@ def innovations_by_axis(
             remedy = source.to_log
         else:
             innovations[axis] = axis_innovations
-            used_topics |= dict.fromkeys(log.topics)
+            used_topics |= dict.fromkeys(aid_log.topics)
             continue
         innovations[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
     return innovations, tuple(used_topics)
@@ -139,18 +144,18 @@ def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     EKF2 rejects all axes of a sample together.
     """
     samples = log.samples
-    nis = {
+    nis_by_axis = {
         name: samples[f"innovation_{name}"] ** 2 / samples[f"variance_{name}"] for name in log.axes
     }
     rejected = samples.get("rejected")
     if rejected is None:
-        rejected = (pd.DataFrame(nis).max(axis=1) > gate**2).astype(float)
+        rejected = (pd.DataFrame(nis_by_axis).max(axis=1) > gate**2).astype(float)
     innovations = pd.DataFrame(
         {
             "innovation_m": samples[f"innovation_{axis}"],
             "innovation_variance_m2": samples[f"variance_{axis}"],
             "observation_variance_m2": samples.get(f"noise_{axis}", np.nan),
-            "test_ratio": nis[axis] / gate**2,
+            "test_ratio": nis_by_axis[axis] / gate**2,
             "fused": samples.get("fused", np.nan),
             "rejected": rejected,
         }

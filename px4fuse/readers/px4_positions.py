@@ -11,9 +11,9 @@ from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
-from px4fuse.flight.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
+from px4fuse.flight.log import REPEATED_TIMESTAMPS, SENDER_CLOCK, ClockMap
 from px4fuse.flight.model import (
-    HEIGHT_ONLY,
+    HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
     Columns,
     Ekf2,
@@ -27,7 +27,7 @@ from px4fuse.flight.model import (
 from px4fuse.flight.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
-    find_invalid,
+    find_invalid_rows,
     finite_rows,
     interpolate_inside,
     join_nearest,
@@ -38,13 +38,13 @@ from px4fuse.readers.common import (
 from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
-from px4fuse.readers.px4_innovations import fused_aid
+from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
-GPS_3D_FIX = 3
+FIX_TYPE_3D = 3
 # Maximum delay (µs) from timestamp to publication of a message with its arrival time as timestamp
 MAX_ARRIVAL_DELAY_US = 100
 # Minimum fraction of arrival times among the timestamps of a topic to report that the topic has no
@@ -75,10 +75,10 @@ def read_positions(
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
-            *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
-            _read_ev_pos_aid(topics, is_odometry),
-            _reconstruct(topics, ekf2, is_odometry),
-            _read_gps(topics, ekf2),
+            *(_read_logged_track(topics, name) for name in px4.SOURCE_TRACKS),
+            _read_fused_observation(topics, is_odometry),
+            _reconstruct_track(topics, ekf2, is_odometry),
+            _read_gnss_track(topics, ekf2),
         ]
     )
 
@@ -88,11 +88,11 @@ def split_tracks(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate the position tracks, best first, from the reasons for missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference)
+    available_tracks.sort(key=lambda track: track.origin.preference_rank)
     return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
 
 
-def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
+def unavailable_source(name: str, reason: str, remedy: str = "") -> Unavailable:
     """Describe a missing position source; the default action is from ``px4_topics.toml``."""
     remedy = remedy or px4.TRACKS[name].remedy
     return Unavailable(f"position source {name}", reason, remedy, source=name)
@@ -127,13 +127,13 @@ def make_track(
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
-        reason = find_invalid(samples, needed_columns)
+        reason = find_invalid_rows(samples, needed_columns)
         samples, invalid = samples[reason == ""], reason[reason != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
         if is_height_only:
-            fault = HEIGHT_ONLY
-        return unavailable(name, fault, remedy)
+            fault = HEIGHT_ONLY_REASON
+        return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
         origin = structs.replace(origin, kind=kind_without_orientation(samples))
     variance = samples[Columns.POSITION_VARIANCE]
@@ -162,17 +162,17 @@ def _make_ulog_track(
     origin = with_orientation(source.origin, is_changing=is_odometry)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
-        arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
-        track_fields = {"lever_arm_m": arm_m, **track_fields}
+        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
+        track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
     fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK, **track_fields}
     fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
     return make_track(name, samples, origin, **fields)
 
 
-def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
+def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
     layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
-        return unavailable(name, f"{name} is not logged")
+        return unavailable_source(name, f"{name} is not logged")
     # Topics of EKF2 have one topic instance per EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
@@ -219,18 +219,18 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
         clock = SENDER_CLOCK
         note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
-        clock = _stamp_clock(published_us, sampled_us)
+        clock = _timestamp_clock(published_us, sampled_us)
         note = "timestamp_sample does not contain boot times in microseconds"
-    elif (distinct := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
+    elif (distinct_count := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
         return ClockMap(
-            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, SHARED_STAMPS, distinct
+            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
         )
     else:
         return None
     return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
-def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
+def _timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     """Return the clock of timestamps that are not boot time in microseconds."""
     if not sampled_us.any():
         return "0"
@@ -246,10 +246,10 @@ def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     return units[0] if units[0] != "microseconds" else "another clock"
 
 
-def _read_ev_pos_aid(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
+def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
-        return unavailable(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
+        return unavailable_source(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
     samples = topics.primary_samples(layout)
     used_topics = [layout.topic]
     notes: tuple[str, ...] = ()
@@ -259,7 +259,7 @@ def _read_ev_pos_aid(topics: Topics, is_odometry: bool) -> PositionTrack | Unava
         used_topics.append(vertical_layout.topic)
     # EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
-    samples = _shift_times(samples, _delay_s(topics) + 0.5 * configured_step_s(topics))
+    samples = _shift_times(samples, _assumed_delay_s(topics) + 0.5 * configured_step_s(topics))
     return _make_ulog_track(
         topics,
         px4.FUSED_OBSERVATION,
@@ -271,8 +271,8 @@ def _read_ev_pos_aid(topics: Topics, is_odometry: bool) -> PositionTrack | Unava
     )
 
 
-def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
-    return samples.set_axis(time_index(samples.index.to_numpy() + by_s))
+def _shift_times(samples: pd.DataFrame, shift_s: float) -> pd.DataFrame:
+    return samples.set_axis(time_index(samples.index.to_numpy() + shift_s))
 
 
 def _with_height(
@@ -284,20 +284,20 @@ def _with_height(
     sample have the same timestamp, but the logger decimates both topics separately.
     """
     joined = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
-    without_height = int(joined.pop("_found").isna().sum())
+    missing_height_count = int(joined.pop("_found").isna().sum())
     note = (
-        f"{without_height} of {len(joined)} external vision positions have no height within "
+        f"{missing_height_count} of {len(joined)} external vision positions have no height within "
         f"{1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms"
     )
-    return joined, (note,) if without_height else ()
+    return joined, (note,) if missing_height_count else ()
 
 
-def _delay_s(topics: Topics) -> float:
+def _assumed_delay_s(topics: Topics) -> float:
     """Return EKF2_EV_DELAY in s, the delay from measurement to timestamp that EKF2 assumes."""
     return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
-def _reconstruct(
+def _reconstruct_track(
     topics: Topics, ekf2: Ekf2 | Unavailable, is_odometry: bool
 ) -> PositionTrack | Unavailable:
     """Reconstruct the source's positions as EKF2 position plus innovation.
@@ -306,7 +306,7 @@ def _reconstruct(
     up to one interval of the source.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable(px4.RECONSTRUCTION, "the log contains no EKF2 state")
+        return unavailable_source(px4.RECONSTRUCTION, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
         + interpolate_inside(innovations.index, ekf2.state[column])
@@ -314,7 +314,9 @@ def _reconstruct(
         if isinstance(innovations, pd.DataFrame)
     }
     if not {"north_m", "east_m"} <= positions.keys():
-        return unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
+        return unavailable_source(
+            px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position"
+        )
     samples = pd.DataFrame({name: positions[name] for name in Columns.POSITION[:2]})
     notes: tuple[str, ...] = ()
     if "down_m" in positions:
@@ -322,7 +324,7 @@ def _reconstruct(
     return _make_ulog_track(
         topics,
         px4.RECONSTRUCTION,
-        _shift_times(samples, _delay_s(topics)),
+        _shift_times(samples, _assumed_delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
         needed_columns=Columns.POSITION[:2],
@@ -395,7 +397,7 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     return pd.DataFrame(ned, index=global_positions.index)
 
 
-def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
+def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """Read GNSS positions, with the measurement times that EKF2 assumes.
 
     The measurement times are the timestamps minus EKF2_GPS_DELAY. PX4 since 2026 uses the driver's
@@ -404,12 +406,12 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
-        return unavailable(px4.GPS_POSITION, f"{px4.GPS_POSITION} is not logged")
+        return unavailable_source(px4.GPS_POSITION, f"{px4.GPS_POSITION} is not logged")
     gps = topics.read_instance(layout)
     if "fix_type" in gps:
-        gps = gps[gps["fix_type"] >= GPS_3D_FIX]
+        gps = gps[gps["fix_type"] >= FIX_TYPE_3D]
     if gps.empty:
-        return unavailable(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
+        return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE in parameters and bool(
@@ -423,7 +425,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
     if len(unlogged_fixes):
         gps = pd.concat([gps, unlogged_fixes]).sort_index()
-        interpolated = int(gps["altitude_m"].isna().sum())
+        interpolated_count = int(gps["altitude_m"].isna().sum())
         # Fields that unlogged fixes lack are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
@@ -447,7 +449,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if len(unlogged_fixes):
         notes.append(
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
-            f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)"
+            f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
     elif rate_hz < MAX_DOWNSAMPLED_HZ:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
@@ -466,11 +468,11 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         clock=clock,
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
-        age_s=delay_ms * 1e-3,
+        assumed_delay_s=delay_ms * 1e-3,
         **track_fields,
     )
     if isinstance(track, PositionTrack):
-        origin = structs.replace(track.origin, is_automatic=fused_aid(ekf2))
+        origin = structs.replace(track.origin, is_automatic=has_fused_aid(ekf2))
         return replace(track, origin=origin)
     return track
 
@@ -504,11 +506,11 @@ def read_truth(
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
             return Truth(global_layout.topic, projected.join(velocity), attitude)
-        if fused_aid(ekf2):
+        if has_fused_aid(ekf2):
             local_samples = _move_to_origin(local_samples, projected)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
+    mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
@@ -532,7 +534,7 @@ def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -
     return moved_samples
 
 
-def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
+def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
     """Return motion capture as ground truth, if the log also contains external vision.
 
     Without external vision, EKF2 may have fused motion capture.

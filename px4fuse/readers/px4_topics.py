@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
@@ -26,7 +26,7 @@ class TrackSource:
     kind: str
     path: str
     description: str
-    # Action to log the track
+    # Action to record positions of this source in the log
     remedy: str
     # Frame of the positions; "unknown": value of the topic's frame field (FRAMES), if it has one
     frame: str = "unknown"
@@ -38,28 +38,28 @@ class TrackSource:
         return find_origin(self.kind, self.path)
 
 
-_TABLE = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
 UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
-HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
+HEIGHT_BIAS_LAYOUTS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
 # Action for topics that the default logging profile contains
-DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
+DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
-ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
+STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
-MAGNETOMETER = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
+MAGNETIC_FIELD_LAYOUTS = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
 # Number of attitude variances, by the lengths of the logged arrays of states and variances: 4 for a
 # filter with quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
-ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
+ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
     (25, 24): 3,
     (32, 28): 4,  # before v1.9: arrays padded after the 24 states of EKF2
 }
-QUATERNION_FILTER = 4
+QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 # Names for ``--position-source``: EKF2's observations, reconstruction from innovations, GNSS
 FUSED_OBSERVATION = "estimator_aid_src_ev_pos"
@@ -67,15 +67,15 @@ RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
 # Tracks of external vision and motion capture that have a separate topic
 SOURCE_TRACKS = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
-TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
+ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACKS.items()}
 # Aiding sources whose flag "fused" is always set in v1.15 and v1.16, so it is not used
-FLAG_ALWAYS_SET = ("gravity", "drag")
+AIDS_ALWAYS_FUSED = ("gravity", "drag")
 # Aiding sources with a local position as logged observation (GNSS has latitude and longitude)
-WITH_OBSERVATION = ("ev_pos", "ev_hgt")
+AIDS_WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with the innovations and the innovation variances of all aiding sources (since v1.12)
-INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
-OLD_INNOVATIONS = "ekf2_innovations"
+INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
+OLD_INNOVATION_TOPIC = "ekf2_innovations"
 
 
 def layouts_of_track(track: str) -> list[Layout]:
@@ -92,5 +92,5 @@ def topics() -> list[str]:
     named_topics = {row.topic for track in TRACKS for row in layouts_of_track(track)}
     named_topics |= {row.topic for row in LAYOUTS.values() if row.topic}
     named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
-    aid_topics = {STATUS_FLAGS, *INNOVATIONS, OLD_INNOVATIONS}
-    return sorted(named_topics | UNUSED_TOPICS.keys() | aid_topics | {*ESTIMATOR_STATES})
+    aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
+    return sorted(named_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

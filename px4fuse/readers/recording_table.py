@@ -19,7 +19,7 @@ import pandas as pd
 from px4fuse.core.reading import display_name, read_text
 from px4fuse.errors import LogError
 from px4fuse.readers import position_names
-from px4fuse.readers.formats import STREAMS
+from px4fuse.readers.formats import STREAM_FORMATS
 from px4fuse.readers.position_names import read_column_name
 from px4fuse.readers.text_table import decode_text, is_number, quote
 
@@ -54,7 +54,7 @@ class Table:
     # Rate of the frame numbers in the time column; None for times
     rate_hz: float | None = None
     # True if the columns belong to one body that was chosen from several
-    is_one_body: bool = False
+    is_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
     def label(self, *columns: int | None) -> str:
@@ -143,25 +143,27 @@ def find_table(
     notes = []
     whole_lines, _, last_line = text.rpartition("\n")
     text = f"{whole_lines}\n"
-    if _is_complete(last_line, whole_lines.rpartition("\n")[2]):
+    if _is_complete_line(last_line, whole_lines.rpartition("\n")[2]):
         text += f"{last_line}\n"
     elif last_line.strip():
         notes.append("the last line of the position file was dropped, because it is incomplete")
-    table = None if columns else _find_json(file_name, text)
+    table = None if columns else _find_json_table(file_name, text)
     text = text.replace('"', "")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     if columns is None and table is None:
-        table = _find_groups(file_name, text, lines, body) or _find_stream(file_name, text, lines)
+        table = _find_body_table(file_name, text, lines, body) or _find_stream_table(
+            file_name, text, lines
+        )
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     if table is None:
-        table = _find_header(file_name, text, lines, wanted_names)
+        table = _find_header_table(file_name, text, lines, wanted_names)
     if table is None and not wanted_names:
-        table = _find_numbers(path, text, lines)
+        table = _find_headerless_table(path, text, lines)
     if table is None:
-        title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
+        column_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
-            f"{title_list}. The first line is {quote(lines[0])}.",
+            f"{column_list}. The first line is {quote(lines[0])}.",
             f"Add a header such as time,x,y,z, or name the columns with {COLUMNS_OPTION}.",
         )
     first_row = table.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
@@ -175,7 +177,7 @@ def find_table(
     return replace(table, notes=(*table.notes, *notes))
 
 
-def _is_complete(line: str, line_before: str) -> bool:
+def _is_complete_line(line: str, line_before: str) -> bool:
     """Return True if the last line has as many columns and decimals as the line before."""
     cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
     decimals, decimals_before = (
@@ -190,7 +192,7 @@ def _split_line(line: str, separator: str) -> list[str]:
     return [field.strip() for field in line.split(separator)]
 
 
-def _find_header(
+def _find_header_table(
     file_name: str, text: str, lines: Sequence[str], wanted_names: set[str]
 ) -> Table | None:
     """Find the first line that names time and position, or contains the wanted names."""
@@ -211,40 +213,43 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
     return has_time and position_names.find_position(meanings) is not None
 
 
-def _find_groups(
+def _find_body_table(
     file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
 ) -> Table | None:
     """Find the columns of one body below the group headers of Motive or Vicon Nexus."""
-    header = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
-    rows = [_split_line(line, ",") for line in lines[: header + 2]]
-    is_motive = header >= 3 and rows[0][0] == "Format Version"
-    if header < 3 or not (is_motive or is_number(rows[1][0])):
+    header_index = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
+    rows = [_split_line(line, ",") for line in lines[: header_index + 2]]
+    is_motive = header_index >= 3 and rows[0][0] == "Format Version"
+    if header_index < 3 or not (is_motive or is_number(rows[1][0])):
         return None
-    axes, body = rows[header], text.split("\n", header + 1)[header + 1]
+    axes, body = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
     rows = [row + [""] * (len(axes) - len(row)) for row in rows]
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
-        row_by_title = {row[1]: row for row in rows[2:header]}
+        row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
         used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
         # Rotations are not read, because the axes of a rigid body are not those of the vehicle
         names = [
             f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
-            for axis, group, body_type in zip(axes, rows[header - 1], body_types, strict=False)
+            for axis, group, body_type in zip(
+                axes, rows[header_index - 1], body_types, strict=False
+            )
         ]
     else:
         body_names = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
         names = [
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
-            for axis, unit in zip(axes, rows[header + 1], strict=False)
+            for axis, unit in zip(axes, rows[header_index + 1], strict=False)
         ]
         body = re.split(r"\n[, ]*\n", body.partition("\n")[2], maxsplit=1)[0] + "\n"
     bodies_with_position = (
         body_name for body_name, name in zip(body_names, names, strict=False) if name
     )
-    chosen = choose_body(file_name, bodies_with_position, wanted_body)
+    chosen_body = choose_body(file_name, bodies_with_position, wanted_body)
     names = [
-        name * (body_name == chosen) for body_name, name in zip(body_names, names, strict=False)
+        name * (body_name == chosen_body)
+        for body_name, name in zip(body_names, names, strict=False)
     ]
     names[:2] = axes[:2] if is_motive else ["time", ""]
     return Table(
@@ -252,18 +257,18 @@ def _find_groups(
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         names,
         body,
-        header_line=header + 1,
+        header_line=header_index + 1,
         # Motive exports y up by default, and z up by an option that the file does not contain
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
-        is_one_body=True,
-        notes=(f"the body is {quote(chosen)}",),
+        is_chosen_body=True,
+        notes=(f"the body is {quote(chosen_body)}",),
     )
 
 
-def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
+def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
     """Convert the positions of a known stream format to a table."""
-    for stream in STREAMS:
+    for stream in STREAM_FORMATS:
         pattern = re.compile(stream["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
         if first_row is not None:
@@ -277,7 +282,7 @@ def _find_stream(file_name: str, text: str, lines: Sequence[str]) -> Table | Non
     return None
 
 
-def _find_json(file_name: str, text: str) -> Table | None:
+def _find_json_table(file_name: str, text: str) -> Table | None:
     """Convert JSON lines to a table; column names are paths such as ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
@@ -306,7 +311,7 @@ def _find_json(file_name: str, text: str) -> Table | None:
     )
 
 
-def _find_numbers(path: Path, text: str, lines: Sequence[str]) -> Table | None:
+def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table | None:
     """Read a table without header as time, x, y, z, or as the matrices of KITTI."""
     plain_lines = (line.partition("#")[0] for line in lines)
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")

@@ -19,24 +19,24 @@ from px4fuse.errors import LogError
 from px4fuse.readers.recording_table import Table
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_PATH = "nav_msgs/msg/Path"
+_PATH_TYPE = "nav_msgs/msg/Path"
 _FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
 _POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
 
 
 # Messages with a position; VehicleOdometry also has the frame
-_TYPES = (
+_POSITION_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
     "geometry_msgs/msg/PointStamped",
     "nav_msgs/msg/Odometry",
-    _PATH,
+    _PATH_TYPE,
     "px4_msgs/msg/VehicleOdometry",
 )
 
 
-def _values(message: Any) -> list[float]:
+def _pose_values(message: Any) -> list[float]:
     """Return x, y, z and, if the message contains them, qx, qy, qz, qw and the σ of x, y and z."""
     if hasattr(message, "q"):
         return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
@@ -102,40 +102,44 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
 
 def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     type_by_topic = {connection.topic: connection.msgtype for connection in reader.connections}
-    usable_topics = [topic_name for topic_name, kind in type_by_topic.items() if kind in _TYPES]
+    usable_topics = [
+        topic_name
+        for topic_name, message_type in type_by_topic.items()
+        if message_type in _POSITION_TYPES
+    ]
     chosen_topic = usable_topics[0] if topic is None and len(usable_topics) == 1 else topic
     if chosen_topic not in usable_topics:
         raise LogError(
             f"{name} contains these topics with positions: {', '.join(usable_topics) or 'none'}",
             f"Give {name}:TOPIC." if usable_topics else "Record the positions as PoseStamped.",
         )
-    kind = type_by_topic[chosen_topic]
+    message_type = type_by_topic[chosen_topic]
     messages = reader.messages(
         [connection for connection in reader.connections if connection.topic == chosen_topic]
     )
-    if kind == _PATH:
+    if message_type == _PATH_TYPE:
         messages = deque(messages, maxlen=1)  # each path repeats the poses of the previous one
     lags_s, rows, frames = [], [], set()
-    for connection, receive_ns, raw in messages:
-        message = reader.deserialize(raw, connection.msgtype)
-        for stamped in message.poses if kind == _PATH else [message]:
-            time_ns = _time_ns(stamped)
-            frames.add(getattr(stamped, "pose_frame", None))
+    for connection, receive_ns, raw_message in messages:
+        message = reader.deserialize(raw_message, connection.msgtype)
+        for stamped_message in message.poses if message_type == _PATH_TYPE else [message]:
+            time_ns = _time_ns(stamped_message)
+            frames.add(getattr(stamped_message, "pose_frame", None))
             lags_s.append((receive_ns - time_ns) * 1e-9)
-            rows.append(f"{time_ns},{str(_values(stamped))[1:-1]}\n")
-    notes = [f"the topic is {chosen_topic} ({kind})"]
+            rows.append(f"{time_ns},{str(_pose_values(stamped_message))[1:-1]}\n")
+    notes = [f"the topic is {chosen_topic} ({message_type})"]
     if rows:
-        low, median, high = np.percentile(lags_s, [2.5, 50.0, 97.5])
+        low_s, median_s, high_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
         notes.append(
-            f"the timestamps in the messages are used; they were received {median:.3f} s later "
-            f"(95 % {low:.3f} to {high:.3f} s)"
+            f"the timestamps in the messages are used; they were received {median_s:.3f} s later "
+            f"(95 % {low_s:.3f} to {high_s:.3f} s)"
         )
     return Table(
         name,
         "ROS bag",
         ["time_ns", *_POSE_COLUMNS[: rows[0].count(",") if rows else 3]],
         "".join(rows),
-        is_one_body=True,
+        is_chosen_body=True,
         frames=("ned",) if frames == {_FRAME_NED} else (),
         notes=tuple(notes),
     )

@@ -54,13 +54,13 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def line_error(name: str, number: int, fault: str, remedy: str) -> TrajectoryError:
+def line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
     """Make an error about one line of a file.
 
     >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
     """
-    return TrajectoryError(f"{name}, line {number}: {fault}. {remedy}")
+    return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ UNIT_NORM_TOLERANCE = 1e-15
 # digits, or that the rows are of several recordings
 MAX_DROPPED_FRACTION = 0.01
 # Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
-MAX_IDENTITY = 1e-6
+MAX_IDENTITY_DISTANCE = 1e-6
 # Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
 MAX_THICKNESS_RATIO = 1 / 3
 # Minimum ratio of width to length of a level motion: a straight motion does not show the vertical
@@ -91,13 +91,13 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     comments = "\n".join(re.findall(r"(?m)^\s*#.*", head))
     kind, kind_note = _detect_kind(path, comments, position, rotation)
     frame, frame_note = _detect_frame(kind, position)
-    time = samples.index.to_numpy()
+    time_s = samples.index.to_numpy()
     notes = (*recording.detected, *recording.notes)
-    more_notes = (kind_note, frame_note, _describe_gaps(time, kind))
+    more_notes = (kind_note, frame_note, _describe_gaps(time_s, kind))
     return Trajectory(
         name=name,
         kind=kind,
-        time_s=time,
+        time_s=time_s,
         position_m=position,
         rotation=rotation,
         frame=_FRAMES.get(recording.frames, frame),
@@ -162,7 +162,7 @@ def _detect_kind(
             return "truth", f"The trajectory is ground truth, according to {source}."
     if (
         rotation is not None
-        and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY
+        and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DISTANCE
     ):
         return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
@@ -174,19 +174,19 @@ def _detect_frame(kind: TrajectoryKind, position: Array) -> tuple[Frame, str]:
     centred_m = position - position.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
     height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
-    tilt = math.acos(min(1.0, abs(float(axes[1, 0]))))
+    tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
     is_level = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width
-    if not is_level or tilt > MAX_TILT_RAD:
+    if not is_level or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
         "The frame is a camera frame (x right, y down, z forward), because the motion is in a "
-        f"plane with the normal {math.degrees(tilt):.0f}° from the y axis."
+        f"plane with the normal {math.degrees(tilt_rad):.0f}° from the y axis."
     )
 
 
-def _describe_gaps(time: Array, kind: TrajectoryKind) -> str:
+def _describe_gaps(time_s: Array, kind: TrajectoryKind) -> str:
     """Return a note on gaps between poses or an irregular pose rate, else an empty text."""
-    intervals_s = np.diff(time)
+    intervals_s = np.diff(time_s)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
     if is_regular.mean() < MIN_REGULAR_FRACTION:
@@ -194,13 +194,13 @@ def _describe_gaps(time: Array, kind: TrajectoryKind) -> str:
             "The poses are key frames, or many poses are missing: the pose intervals are irregular "
             f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."
         )
-    gaps = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
-    if not len(gaps):
+    gap_indices = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
+    if not len(gap_indices):
         return ""
-    lost_s = intervals_s[gaps] - median_s
-    longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
+    lost_s = intervals_s[gap_indices] - median_s
+    longest_start_s = time_s[gap_indices[np.argmax(lost_s)]] - time_s[0]
     fault = "Tracking was lost" if kind == "slam" else "Poses are missing"
     return (
-        f"{fault} for {lost_s.sum():.1f} s in {len(gaps)} gaps. The longest gap begins "
+        f"{fault} for {lost_s.sum():.1f} s in {len(gap_indices)} gaps. The longest gap begins "
         f"{longest_start_s:.1f} s after the first pose."
     )

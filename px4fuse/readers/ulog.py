@@ -19,7 +19,7 @@ from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
-from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
+from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
@@ -41,7 +41,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     topics = read_topics(name, content)
     remedy = "Check that the sensors were running during logging."
     imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
-    attitude_samples = common.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
+    attitude_samples = common.rows_with_attitude(topics.read(px4.LAYOUTS["attitude"]))
     remedy = "Check that the estimator was running during logging."
     attitude = _require_samples(
         topics, attitude_samples, "attitude", px4.LAYOUTS["attitude"], remedy
@@ -54,7 +54,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     airborne = _read_airborne(topics)
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
-    in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
+    is_in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
     dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
     tilt_failures = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]]
     return Flight(
@@ -63,8 +63,8 @@ def read_ulog(name: str, content: bytes) -> Flight:
             notes=(*topics.log.notes, *dropped_notes(dropped)),
             dropped=dict(dropped),
             start_unix_s=_start_unix_s(topics),
-            damage=_describe_damage(topics, imu, in_flight),
-            ends_in_flight=in_flight,
+            damage=_describe_damage(topics, imu, is_in_flight),
+            ends_in_flight=is_in_flight,
         ),
         imu=imu,
         attitude=attitude,
@@ -84,11 +84,13 @@ def read_ulog(name: str, content: bytes) -> Flight:
     )
 
 
-def _describe_damage(topics: Topics, imu: TableOrUnavailable, in_flight: bool) -> tuple[str, ...]:
+def _describe_damage(
+    topics: Topics, imu: TableOrUnavailable, is_in_flight: bool
+) -> tuple[str, ...]:
     end_s = topics.log.duration_s
     damage_sentences = []
-    if topics.is_cut:
-        damage_sentences.append(common.format_truncation("message", end_s, in_flight))
+    if topics.is_truncated:
+        damage_sentences.append(common.format_truncation("message", end_s, is_in_flight))
     if topics.is_damaged:
         missing_s = end_s
         if not isinstance(imu, Unavailable):
@@ -108,7 +110,7 @@ def _start_unix_s(topics: Topics) -> float | None:
     utc_s = gps["utc_us"] * 1e-6
     is_valid = utc_s.between(*UTC_RANGE_S)
     if "fix_type" in gps:
-        is_valid &= gps["fix_type"] >= GPS_3D_FIX
+        is_valid &= gps["fix_type"] >= FIX_TYPE_3D
     return float((utc_s - gps.index)[is_valid].median()) if is_valid.any() else None
 
 
@@ -118,7 +120,7 @@ def _require_samples(
     """Return the samples, or the reason why too few are in the log."""
     topic = layout.topic
     if topics.find(layout) is None:
-        return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)
+        return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)
     if len(samples) < 2:
         return Unavailable(name, f"{topic} contains only {len(samples)} usable samples", remedy)
     topics.record_stream(name.lower(), topic)
@@ -143,7 +145,7 @@ def _read_airborne(topics: Topics) -> Spans | Unavailable:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            f"{px4.DEFAULT_PROFILE} Or give the time of the flight with --start and --end.",
+            f"{px4.DEFAULT_PROFILE_REMEDY} Or give the time of the flight with --start and --end.",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)

@@ -44,7 +44,7 @@ MAX_PUBLICATION_LAG_S = 10.0
 # outdated
 MAX_OUTSIDE_S = 2.0
 # Last byte of ver_sw_release in a PX4 release
-RELEASE_TYPE = 255
+FINAL_RELEASE_TYPE = 255
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # Key of the information that a simulated log is an assignment for a student
@@ -85,7 +85,7 @@ Instances = tuple[tuple[float, int], ...]
 NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
-class _Content(io.BytesIO):
+class _CountingContent(io.BytesIO):
     """Content of a ULog that counts the bytes that pyulog skips.
 
     pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
@@ -157,13 +157,14 @@ class _Reader(ULog):  # type: ignore[misc]
     @_skip_if_short
     def _MessageAddLogged(self, data: bytes, header: Any, formats: Any) -> Any:  # noqa: N802
         @cache
-        def count(name: str) -> int:
+        def count_fields(name: str) -> int:
             fields: list[tuple[str, int, str]] = formats[name].fields
             return 1 + sum(
-                max(size, 1) * (count(kind) if kind in formats else 1) for kind, size, _ in fields
+                max(size, 1) * (count_fields(kind) if kind in formats else 1)
+                for kind, size, _ in fields
             )
 
-        self.fields += count(self.parse_string(data[3:]))
+        self.fields += count_fields(self.parse_string(data[3:]))
         if self.fields > MAX_FIELDS:
             raise ULogException(f"the topics have more than {MAX_FIELDS:,} fields")
         return ULog._MessageAddLogged(data, header, formats)
@@ -183,7 +184,7 @@ class Topics:
     # All EKF2_ parameters at take-off; ``log`` contains only those in the results
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
-    is_cut: bool
+    is_truncated: bool
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
     # Topics and clock of each kind of data in the flight
@@ -393,14 +394,14 @@ def read_topics(name: str, content: bytes) -> Topics:
     LogError
         The content is not a ULog, or contains no data with valid timestamps.
     """
-    source = _Content(content)
-    size = len(content)
+    content_reader = _CountingContent(content)
+    size_bytes = len(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
-            ulog = _Reader(source, message_name_filter_list=topics())
+            ulog = _Reader(content_reader, message_name_filter_list=topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
-            time_tables = tables or _read_tables(_Reader(_Content(content)))
+            time_tables = tables or _read_tables(_Reader(_CountingContent(content)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
@@ -419,13 +420,13 @@ def read_topics(name: str, content: bytes) -> Topics:
         )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    zero_us, end_us = _data_span(time_tables, name)
-    numbers, parameter_changes = _read_parameters(ulog, tables, zero_us)
-    parameter_values, parameter_faults = replace_invalid_parameters(numbers)
+    zero_us, end_us = _data_span_us(time_tables, name)
+    logged_values, parameter_changes = _read_parameters(ulog, tables, zero_us)
+    parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
-        bytes=size,
+        bytes=size_bytes,
         format="ULog",
         firmware=_firmware_text(ulog.msg_info_dict),
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
@@ -449,7 +450,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             if name in PARAMETERS
         },
         notes=(*notes, *parameter_faults),
-        bytes_read=source.start - source.skipped_bytes,
+        bytes_read=content_reader.start - content_reader.skipped_bytes,
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
         is_assessed=True
@@ -459,14 +460,14 @@ def read_topics(name: str, content: bytes) -> Topics:
     parameters = {
         name: value for name, value in parameter_values.items() if name.startswith("EKF2_")
     }
-    is_cut = source.start < size < source.end
+    is_truncated = content_reader.start < size_bytes < content_reader.end
     return Topics(
         log,
         tables,
         zero_us,
         {},
         MappingProxyType(parameters),
-        is_cut,
+        is_truncated,
         ulog.file_corruption,
         parameter_changes=parameter_changes,
     )
@@ -527,7 +528,7 @@ def _read_tables(ulog: ULog) -> Tables:
     return tables
 
 
-def _data_span(tables: Tables, name: str) -> tuple[int, int]:
+def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
     """Return first and last time (µs) of the IMU data, or else of the topic with most samples."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
@@ -557,7 +558,7 @@ def _firmware_text(info: dict[str, Any]) -> str:
     # release
     suffix = (
         ""
-        if release_type == RELEASE_TYPE
+        if release_type == FINAL_RELEASE_TYPE
         else ("-dev", "-alpha", "-beta", "-rc")[release_type // 64]
     )
     return f"{_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"

@@ -46,7 +46,11 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
         _statistics(summary, result.replayed)
         if summary.is_predictable
         else dict.fromkeys(labels, NOT_PREDICTABLE)
-        for summary in (result.logged, result.replayed, *result.whatif[: analysis.sweep_start])
+        for summary in (
+            result.logged,
+            result.replayed,
+            *result.whatif[: analysis.sweep_start_index],
+        )
     ]
     return [[label, *(column.get(label, "n/a") for column in columns)] for label in labels]
 
@@ -115,7 +119,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
 
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
-    return analysis.whatif.whatif[analysis.sweep_start :]
+    return analysis.whatif.whatif[analysis.sweep_start_index :]
 
 
 def swept_parameter(analysis: WhatIfAnalysis) -> str:

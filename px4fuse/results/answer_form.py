@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.core.reading import read_text
-from px4fuse.core.record import Record, Sha256, table
+from px4fuse.core.record import Record, Sha256, read_toml
 from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 
@@ -58,7 +58,7 @@ class FormChoices(Record, frozen=True):
     renamed: dict[str, str]
 
 
-_CHOICES = table(__file__, "form.toml", FormChoices)
+_CHOICES = read_toml(__file__, "form.toml", FormChoices)
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
 # Units of the value of a correction (empty without a value), by name of the correction

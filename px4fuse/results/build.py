@@ -92,7 +92,7 @@ def sync_results(
 
 
 def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
-    summaries, sweep_start = analysis.whatif, analysis.sweep_start
+    summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
@@ -101,8 +101,8 @@ def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract
             asked=analysis.uses_estimates,
             logged=summaries.logged,
             replayed=summaries.replayed,
-            whatif=summaries.whatif[0] if sweep_start else None,
-            sweep=summaries.whatif[sweep_start:],
+            whatif=summaries.whatif[0] if sweep_start_index else None,
+            sweep=summaries.whatif[sweep_start_index:],
             notes=summaries.notes,
         )
     )

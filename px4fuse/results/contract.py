@@ -365,7 +365,7 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
     return list(schemas[: len(types)]), components
 
 
-def to_plain(results: msgspec.Struct) -> dict[str, Any]:
+def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
     """Convert results to dicts, lists and numbers, with the field names of the JSON file."""
     plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_to_builtin)
     return plain_results
@@ -407,7 +407,7 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     ValueError
         The results contain a number that is not finite.
     """
-    plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
+    plain_results = to_json_dict(results) if isinstance(results, msgspec.Struct) else results
     rounded_results = _round_numbers(plain_results)
     return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 

@@ -7,7 +7,7 @@ fault has a default size that px4fuse detects easily.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bounds_by_field
@@ -104,7 +104,7 @@ MISTAKES: Mapping[str, Mistake] = {
             field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
         ),
     )
-    for name, mistake in table(__file__, "mistakes.toml", dict[str, Mistake]).items()
+    for name, mistake in read_toml(__file__, "mistakes.toml", dict[str, Mistake]).items()
 }
 
 

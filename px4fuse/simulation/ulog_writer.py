@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.readers import ULOG_MAGIC
 
 _ULOG_VERSION = b"\x01"
@@ -19,7 +19,7 @@ _ULOG_VERSION = b"\x01"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
 # Type, default value (if any) and length of each field, by topic and field name
-TOPIC_FIELDS = table(__file__, "topics.toml", dict[str, dict[str, str]])
+TOPIC_FIELDS = read_toml(__file__, "topics.toml", dict[str, dict[str, str]])
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from pypdf.generic import (
 )
 
 from px4fuse.core.text import one_line
-from px4fuse.core.workers import JobFailure, run_one_bounded
+from px4fuse.core.workers import JobFailure, run_one_with_limits
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pdf_input import (
     BROKEN_PDF_ERRORS,
@@ -126,7 +126,7 @@ def compare_pages(
     is the only difference.
     """
     job = submitted_pdf, redrawn_pdf, is_same_text
-    differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
+    differences = run_one_with_limits(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")

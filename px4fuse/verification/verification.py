@@ -29,7 +29,7 @@ from px4fuse.results.contract import (
     LoopResults,
     ReportedResults,
     to_json,
-    to_plain,
+    to_json_dict,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verification
@@ -282,7 +282,7 @@ def _verify_with_log(
             "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
         )
     mismatches, is_same_number, value_count = compare_results(
-        to_plain(submitted_results), to_plain(new_results)
+        to_json_dict(submitted_results), to_json_dict(new_results)
     )
     reasons = [
         f"all {value_count} values agree with a new run on the log (within "

@@ -40,7 +40,7 @@ from px4fuse.flight.model import Flight
 from px4fuse.report import clock, phrases
 from px4fuse.request import ComparisonRequest, WhatIfRequest
 from px4fuse.results import build
-from px4fuse.results.contract import to_plain
+from px4fuse.results.contract import to_json_dict
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
@@ -90,16 +90,16 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     if not isinstance(analysis, Analysis):
         return {}
     outputs: Outputs = {
-        "json": to_plain(build.results(request, analysis)),
+        "json": to_json_dict(build.results(request, analysis)),
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
     comparison = prepare_comparison(request, flight=flight)
     noises = tuned(comparison)
     outputs["tune"] = phrases.tuning_advice(comparison, noises)
-    outputs["tune_json"] = to_plain(build.tuning_results(request, comparison, noises))
+    outputs["tune_json"] = to_json_dict(build.tuning_results(request, comparison, noises))
     _, offset = estimate_noises_and_clock(comparison)
     outputs["sync"] = clock.clock_advice(comparison, offset)
-    outputs["sync_json"] = to_plain(build.sync_results(request, comparison, offset))
+    outputs["sync_json"] = to_json_dict(build.sync_results(request, comparison, offset))
     if request.position is None:
         asked = WhatIfRequest(log=request.log)
         try:
@@ -107,7 +107,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         except Px4FuseError as error:
             outputs["whatif_error"] = str(error)
         else:
-            outputs["whatif_json"] = to_plain(build.whatif_results(asked, replayed))
+            outputs["whatif_json"] = to_json_dict(build.whatif_results(asked, replayed))
     return outputs
 
 

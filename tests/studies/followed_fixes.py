@@ -43,7 +43,7 @@ from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Truth, Unavailable
 from px4fuse.request import ComparisonRequest, PositionFile
 from px4fuse.results import build
-from px4fuse.results.contract import to_plain
+from px4fuse.results.contract import to_json_dict
 
 # Block length (s) of independent errors for the uncertainty of an RMSE
 BLOCK_S = 5.0
@@ -140,7 +140,7 @@ def replayed_m(model: Model, change: dict[str, float]) -> tuple[float, float]:
 
 def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
     """Return the fixes of one analysed flight with their effect."""
-    outputs = {"json": to_plain(build.results(request, analysis))}
+    outputs = {"json": to_json_dict(build.results(request, analysis))}
     actions: dict[tuple[str, tuple[tuple[str, Any], ...]], list[str]] = {}
     for kind, change, place in proposed(outputs):
         actions.setdefault((kind, tuple(sorted(change.items()))), []).append(place)

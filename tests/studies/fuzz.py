@@ -247,7 +247,7 @@ def _command(*words: str) -> Callable[[Path], object]:
         given = [word.format(path=path, out=out) for word in words]
         with contextlib.ExitStack() as stack:
             for module in (grading, workers):
-                stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
+                stack.enter_context(mock.patch.object(module, "run_with_limits", run_in_turn))
             done = CliRunner().invoke(cli, given)
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception

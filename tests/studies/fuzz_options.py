@@ -241,7 +241,7 @@ def run_once(name: str, rng: random.Random, out: Path) -> tuple[str, str]:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("error")
         for module in (grading, workers):
-            stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
+            stack.enter_context(mock.patch.object(module, "run_with_limits", run_in_turn))
         if rng.random() > DRAWN_SHARE:
             stack.enter_context(mock.patch.object(pdf, "render", blank_page))
         done = CliRunner().invoke(cli, words)

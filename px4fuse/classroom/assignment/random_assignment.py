@@ -16,7 +16,7 @@ from itertools import accumulate
 from typing import Any, Literal
 
 from px4fuse.classroom.assignment.roster import normalise_text
-from px4fuse.core.record import Record, table
+from px4fuse.core.record import Record, read_toml
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
@@ -105,7 +105,7 @@ class DrawingRules(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = table(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
+RULES_BY_KIND = read_toml(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare
-from px4fuse.core.record import Record, table
+from px4fuse.core.record import Record, read_toml
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
@@ -51,7 +51,7 @@ IGNORED_RESETS_S = 5.0
 # Ratio of the upper to the lower limit of a range from which the student chooses
 PREDICTION_RANGE_FACTOR = 1.35
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
-BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
+BEHAVIOUR_RULES = read_toml(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class TrueMistake(Record, frozen=True):

@@ -29,7 +29,7 @@ from px4fuse.results.contract import (
     ESTIMATE_FIELD_BY_SETTING,
     ComparisonResults,
     ReportedResults,
-    to_plain,
+    to_json_dict,
 )
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.verification.model import Verification
@@ -121,7 +121,7 @@ class CheckInput:
     @cached_property
     def values(self) -> dict[str, Any]:
         """Values of the results by path, for example ``settings.sigma_z_m``."""
-        return dict(flatten(to_plain(self.results)))
+        return dict(flatten(to_json_dict(self.results)))
 
     @cached_property
     def answer(self) -> RightAnswers | None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
     MISTAKES,
     NO_MISTAKE_KIND,
@@ -68,7 +68,7 @@ class _CorrectionRule(NamedTuple):
     right_values: tuple[float, float] | str = ANY_BOUNDS
 
 
-POINTS_TABLE = table(__file__, "form_points.toml", dict)
+POINTS_TABLE = read_toml(__file__, "form_points.toml", dict)
 CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
 NEIGHBOURS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(POINTS_TABLE["weights"])

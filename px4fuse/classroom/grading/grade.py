@@ -16,7 +16,7 @@ from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, score_report
 from px4fuse.core.reading import files_by_sha256, max_log_bytes
 from px4fuse.core.text import one_line
-from px4fuse.core.workers import JobFailure, run_bounded
+from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import ResultsError
 
 FAILED_REMEDY = "Do not open the file. Ask the student for the PDF that px4fuse wrote."
@@ -99,7 +99,7 @@ def grade(
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
-    with closing(run_bounded(grade_job, jobs, processes=processes)) as results:
+    with closing(run_with_limits(grade_job, jobs, processes=processes)) as results:
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"

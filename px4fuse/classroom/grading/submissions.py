@@ -36,7 +36,7 @@ from px4fuse.classroom.assignment.roster import Person, make_unique
 from px4fuse.classroom.grading.model import UNKNOWN_SUBMITTER, ExportOrigin, Submission
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import files_below
-from px4fuse.core.record import table
+from px4fuse.core.record import read_toml
 from px4fuse.core.text import clean_text, join_first, one_line
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
@@ -68,7 +68,7 @@ GRADESCOPE_METADATA = "submission_metadata.yml"
 # Pattern of the file paths in an export, by learning platform
 PLATFORMS = {
     name: re.compile(pattern)
-    for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
+    for name, pattern in read_toml(__file__, "platforms.toml", dict[str, str]).items()
 }
 # Texts that a platform writes once into a path: the student wrote any further occurrence
 _PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
