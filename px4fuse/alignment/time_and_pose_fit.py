@@ -209,12 +209,12 @@ def fit_by_least_squares(
     information = jacobian.T @ jacobian
     # The added diagonal gives a huge variance instead of an error for a singular matrix
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)
-    variance = (
+    parameter_variance = (
         np.diag(np.linalg.inv(information))
         * _robust_scale(residuals) ** 2
         * _autocorrelation_factor(complex_residuals)
     )
-    sigma = np.sqrt(np.maximum(variance, 0.0))
+    parameter_sigma = np.sqrt(np.maximum(parameter_variance, 0.0))
     is_at_limit = is_lag_free and abs(lag_shift_s) > 0.99 * MAX_LAG_SHIFT_S
     reference_ned_m, _ = reference.at(reference_time_s + lag_shift_s)
     down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
@@ -231,12 +231,12 @@ def fit_by_least_squares(
     origin = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,
-        lag_sigma_s=(np.inf if is_at_limit else float(sigma[2])) if is_lag_free else None,
+        lag_sigma_s=(np.inf if is_at_limit else float(parameter_sigma[2])) if is_lag_free else None,
         concordance=concordance,
         second_peak_s=peak.second_peak_s,
         second_peak_ratio=peak.second_peak_ratio,
         yaw_rad=yaw,
-        yaw_sigma_rad=float(sigma[-1]) if yaw_rad is None else None,
+        yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([origin.real, origin.imag, origin_down_m]),
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms_m),
@@ -251,8 +251,8 @@ def _robust_scale(residual: Array) -> float:
 
 def _autocorrelation_factor(residual: Complex) -> float:
     """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
-    limit = 3.0 * _robust_scale(np.abs(residual))
-    clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
+    clip_limit = 3.0 * _robust_scale(np.abs(residual))
+    clipped = residual * np.minimum(1.0, clip_limit / np.maximum(np.abs(residual), 1e-12))
     covariance_by_lag = autocovariance(clipped)
     if covariance_by_lag[0] <= 0.0:
         return 1.0

@@ -82,9 +82,9 @@ class SampledTrack:
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
         """Interpolate the position at times; also return a mask of the times outside of gaps."""
-        position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
+        columns_m = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
-        return np.stack(position, axis=1), is_valid
+        return np.stack(columns_m, axis=1), is_valid
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
@@ -196,9 +196,9 @@ def align_samples(
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
     if yaw_rad:  # a rotation mixes both axes, so both sigmas are then needed
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-        rotation = np.array([[c, -s], [s, c]])
-        position_m[:, :2] = position_m[:, :2] @ rotation.T
-        variance_m2[:, :2] = variance_m2[:, :2] @ (rotation**2).T
+        yaw_rotation = np.array([[c, -s], [s, c]])
+        position_m[:, :2] = position_m[:, :2] @ yaw_rotation.T
+        variance_m2[:, :2] = variance_m2[:, :2] @ (yaw_rotation**2).T
     return pd.DataFrame(
         np.hstack([position_m + origin_m, variance_m2]),
         time_index(track.time_s + lag_s),

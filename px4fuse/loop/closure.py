@@ -50,10 +50,12 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axis_order, axis_signs, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    variance = trajectory.position_variance_m2
+    position_variance_m2 = trajectory.position_variance_m2
     return replace(
         _rotate(trajectory, np.diag(axis_signs) @ np.eye(3)[axis_order], z_down_frame),
-        position_variance_m2=None if variance is None else variance[:, axis_order],
+        position_variance_m2=None
+        if position_variance_m2 is None
+        else position_variance_m2[:, axis_order],
         rotation_variance_rad2=trajectory.rotation_variance_rad2,
         notes=(*trajectory.notes, note),
     )
@@ -69,13 +71,13 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     """Rotate a trajectory to another frame, and convert camera axes to body axes or the reverse."""
-    rotation = Rotation.from_matrix(matrix)
+    axes_rotation = Rotation.from_matrix(matrix)
     rotated = replace(
-        trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame
+        trajectory.with_positions(trajectory.position_m @ matrix.T, axes_rotation), frame=frame
     )
     if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
         return rotated
-    return replace(rotated, rotation=rotated.rotation * rotation.inv())
+    return replace(rotated, rotation=rotated.rotation * axes_rotation.inv())
 
 
 def default_key_frame_spacing_m(position_m: Array) -> float:
@@ -143,9 +145,11 @@ def correct_by_distance(
     the distance. The remaining position error is distributed by the compass rule.
     """
     position_m = trajectory.position_m
-    fraction = cumulative_distance_m / cumulative_distance_m[-1]
-    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN_DIRECTION))
-    middle_fraction = (fraction[1:] + fraction[:-1]) / 2.0
+    distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
+    correction_rotation = Rotation.from_rotvec(
+        np.outer(-distance_fraction * misclosure_heading_rad, DOWN_DIRECTION)
+    )
+    middle_fraction = (distance_fraction[1:] + distance_fraction[:-1]) / 2.0
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
@@ -154,5 +158,6 @@ def correct_by_distance(
     )
     remaining_error_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(
-        distribute_by_distance(rotated_m, remaining_error_m, cumulative_distance_m), rotation
+        distribute_by_distance(rotated_m, remaining_error_m, cumulative_distance_m),
+        correction_rotation,
     )

@@ -80,11 +80,11 @@ def gate_closures(
         return ()
     closure_edges = np.arange(len(graph.first) - len(closures_and_landings), len(graph.first))
     closures = []
-    for result, (closure, true_end) in zip(
+    for gate_result, (closure, true_end) in zip(
         gate_edges(graph, closure_edges), closures_and_landings, strict=True
     ):
-        odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
-        closure_fields = structs.asdict(closure) | structs.asdict(result)
+        odometry_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
+        closure_fields = structs.asdict(closure) | structs.asdict(gate_result)
         del closure_fields["first"], closure_fields["second"]
         closure_fields["source"] = "given" if true_end is None else LANDING_SOURCE
         true_m = np.zeros(3) if true_end is None else true_end.displacement
@@ -154,22 +154,24 @@ def _interpolate_corrections(
     path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
     """Correct each pose by interpolation between the corrections of neighbouring graph nodes."""
-    rotation = (
+    node_rotations = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
     previous_node = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
     previous_node = np.clip(previous_node, 0, len(nodes) - 2)
-    time = path.time_s
-    fraction = (time - time[nodes[previous_node]]) / (
-        time[nodes[previous_node + 1]] - time[nodes[previous_node]]
+    time_s = path.time_s
+    next_node_fraction = (time_s - time_s[nodes[previous_node]]) / (
+        time_s[nodes[previous_node + 1]] - time_s[nodes[previous_node]]
     )
     corrected_poses = [
-        solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
+        solved_poses[node, :3] + node_rotations[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
     ]
-    weight = np.clip(fraction, 0.0, 1.0)[:, None]
-    position = (1.0 - weight) * corrected_poses[0] + weight * corrected_poses[1]
-    return path.with_positions(position, Slerp(time[nodes], rotation)(time))
+    next_node_weight = np.clip(next_node_fraction, 0.0, 1.0)[:, None]
+    position_m = (1.0 - next_node_weight) * corrected_poses[0] + next_node_weight * corrected_poses[
+        1
+    ]
+    return path.with_positions(position_m, Slerp(time_s[nodes], node_rotations)(time_s))
 
 
 def score_paths(

@@ -34,17 +34,17 @@ def cut_trajectory(
     TrajectoryError
         The segment contains fewer than three poses.
     """
-    time = trajectory.time_s
+    time_s = trajectory.time_s
     segment_track = trajectory.between(segment.start_s, segment.end_s)
     if len(segment_track) < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {len(segment_track)} "
+            f"{trajectory.name} ({time_s[0]:.2f} s to {time_s[-1]:.2f} s) has {len(segment_track)} "
             f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; at least "
             f"{MIN_POSES} are needed"
         )
     if not rests_at_ends:
         return segment_track
-    position = segment_track.position_m.copy()
+    position_m = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
         poses_at_rest = trajectory.between(rest_start_s, rest_start_s + REST_TIME_S)
@@ -54,11 +54,11 @@ def cut_trajectory(
             or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0)) > MAX_REST_RANGE_M
         ):
             continue
-        position[index] = poses_at_rest.position_m.mean(axis=0)
+        position_m[index] = poses_at_rest.position_m.mean(axis=0)
         if quaternions is not None and poses_at_rest.rotation is not None:
             quaternions[index] = poses_at_rest.rotation.mean().as_quat()
     rotation = None if quaternions is None else Rotation.from_quat(quaternions)
-    return replace(segment_track, position_m=position, rotation=rotation)
+    return replace(segment_track, position_m=position_m, rotation=rotation)
 
 
 def choose_loop_segment(

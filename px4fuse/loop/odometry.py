@@ -130,8 +130,8 @@ def build_pose_graph(
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
     nodes = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
     end_nodes = np.searchsorted(nodes, pose_indices)
-    position = path.position_m[nodes]
-    rotation = path.rotation[nodes]
+    node_position_m = path.position_m[nodes]
+    node_rotation = path.rotation[nodes]
     translation_m2, rotation_rad2, variance_note = odometry_variances(path, nodes, noise)
     steps = np.arange(len(nodes) - 1)
     first_nodes = np.append(steps, end_nodes[:, 0])
@@ -141,33 +141,35 @@ def build_pose_graph(
         [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
     )
     information[steps[:, None], range(6), range(6)] = diagonal
-    first_inverse = rotation[first_nodes].inv()
-    second_rotation = rotation[second_nodes]
-    translation_measured = first_inverse.apply(position[second_nodes] - position[first_nodes])
-    for row, (closure, true_end) in enumerate(closures_and_landings, start=len(steps)):
-        translation_measured[row] = (
-            0.0 if true_end is None else first_inverse[row].apply(true_end.displacement)
+    first_inverse = node_rotation[first_nodes].inv()
+    second_rotation = node_rotation[second_nodes]
+    translation_measured = first_inverse.apply(
+        node_position_m[second_nodes] - node_position_m[first_nodes]
+    )
+    for edge_index, (closure, true_end) in enumerate(closures_and_landings, start=len(steps)):
+        translation_measured[edge_index] = (
+            0.0 if true_end is None else first_inverse[edge_index].apply(true_end.displacement)
         )
-        information[row, range(3), range(3)] = closure.sigma_m**-2
+        information[edge_index, range(3), range(3)] = closure.sigma_m**-2
         if true_end is not None and true_end.heading_change_deg is not None:
             odometry_change_rad = heading_change_rad(
-                second_rotation[row] * rotation[first_nodes[row]].inv()
+                second_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
             )
             error_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_change_rad)
             )
-            second_rotation[row] = (
-                Rotation.from_rotvec(error_rad * DOWN_DIRECTION) * second_rotation[row]
+            second_rotation[edge_index] = (
+                Rotation.from_rotvec(error_rad * DOWN_DIRECTION) * second_rotation[edge_index]
             )
-            vertical_direction = second_rotation[row].inv().apply(DOWN_DIRECTION)
+            vertical_direction = second_rotation[edge_index].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
-            information[row, 3:, 3:] = (
+            information[edge_index, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
             )
     graph = PoseGraph(
         dimension=3,
         ids=np.arange(len(nodes)),
-        poses=np.column_stack([position, rotation.as_quat()]),
+        poses=np.column_stack([node_position_m, node_rotation.as_quat()]),
         first=first_nodes,
         second=second_nodes,
         measurements=np.column_stack(

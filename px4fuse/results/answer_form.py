@@ -249,16 +249,16 @@ def read_answers(path: Path) -> Answers:
     SettingsError
         The file is not an answer form, or an answer is not allowed.
     """
-    text = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
-    if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
+    form_toml = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
+    if any(len(line) > MAX_LINE_LENGTH for line in form_toml.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
     record: dict[str, Any] = {}
     try:
-        record = _convert_form(tomllib.loads(text))
+        record = _convert_form(tomllib.loads(form_toml))
         answers = msgspec.convert(record, Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        message = _describe_error(error, text, record)
+        message = _describe_error(error, form_toml, record)
         raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
 

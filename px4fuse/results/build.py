@@ -40,8 +40,12 @@ def results(
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
-        rows = form_rows(student.answers)
-        texts = (f"{label}: {text}" for label, text in rows if text != EMPTY_CELL)
+        question_rows = form_rows(student.answers)
+        texts = (
+            f"{label}: {answer_text}"
+            for label, answer_text in question_rows
+            if answer_text != EMPTY_CELL
+        )
         card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
     fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),

@@ -259,8 +259,8 @@ def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSample
     """Make the height samples of the barometer, the only height source of EKF2 outdoors."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    no_dead_zone, weight = np.zeros(len(down_m)), np.ones(len(down_m))
-    samples = barometer_samples_inside(segment, measured_at_s, down_m, no_dead_zone, weight)
+    no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
+    samples = barometer_samples_inside(segment, measured_at_s, down_m, no_dead_zone, sample_weight)
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
 
 
@@ -300,8 +300,8 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
     is_newer = timestamp_s > latest_timestamp_s
-    velocity = source.velocity_m_s
-    if velocity is not None:
+    velocity_m_s = source.velocity_m_s
+    if velocity_m_s is not None:
         sigmas_m = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)
         position_variance = sigmas_m[is_newer] ** 2
         velocity_variance = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
@@ -315,7 +315,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
         rejected=np.full(int(is_newer.sum()), np.nan),
         reset=np.zeros(int(is_newer.sum()), dtype=bool),
         source=source.topic.name,
-        velocity_m_s=None if velocity is None else velocity[is_newer],
+        velocity_m_s=None if velocity_m_s is None else velocity_m_s[is_newer],
         velocity_variance_m2_s2=velocity_variance,
     )
 
@@ -331,27 +331,27 @@ def _make_topic_track(
     for step, reset_m in resets:
         reset_sum_m[step:, :2] += reset_m
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    gyro_bias_ned = np.einsum(
+    gyro_bias_rad_s = np.einsum(
         "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
-    attitude_steps = -segment.correction_rad - gyro_bias_ned * segment.step_s[:, None]
-    gyro_attitude_error = state[0, THETA] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(attitude_steps, axis=0)]
+    attitude_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
+    gyro_attitude_error_rad = state[0, THETA] + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(attitude_steps_rad, axis=0)]
     )
-    attitude_error = gyro_attitude_error + follow_attitude(
-        state[:, THETA] - gyro_attitude_error, lag_steps, inputs.step_s, inputs.horizon_s
+    attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
+        state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.step_s, inputs.horizon_s
     )
-    velocity, position = publish(
-        segment, state, reset_sum_m, attitude_error, lag_steps, inputs.settings
+    velocity_m_s, position_m = publish(
+        segment, state, reset_sum_m, attitude_error_rad, lag_steps, inputs.settings
     )
     return TopicTrack(
         time_us=time_us,
         lag_steps=lag_steps,
         delayed_attitude=multiply(from_vector(state[:, THETA]), true_quaternions),
         delayed_states=state[:, 3:],
-        velocity_m_s=velocity,
-        position_m=position,
-        attitude=multiply(from_vector(attitude_error), true_quaternions),
+        velocity_m_s=velocity_m_s,
+        position_m=position_m,
+        attitude=multiply(from_vector(attitude_error_rad), true_quaternions),
         resets=tuple((step + lag_steps, reset_m) for step, reset_m in resets),
         is_step_aided=is_step_aided,
     )
@@ -364,19 +364,19 @@ def _hold_without_aiding(
 
     Return the position resets (step, size in m), and a mask of the steps with an aiding source.
     """
-    events, time = model_run.events[0], model_run.segment.time_s
+    events, time_s = model_run.events[0], model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
-    last_aid_s = np.zeros(len(time))
-    last_aid_s[events.end_step[aid_events]] = time[events.end_step[aid_events]]
-    is_step_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
+    last_aid_s = np.zeros(len(time_s))
+    last_aid_s[events.end_step[aid_events]] = time_s[events.end_step[aid_events]]
+    is_step_aided = time_s - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
     aiding_ends = np.flatnonzero(np.diff(is_step_aided.astype(int)) == -1) + 1
     aiding_starts = np.flatnonzero(np.diff(is_step_aided.astype(int)) == 1) + 1
-    for start, end in zip(
-        aiding_ends, [*aiding_starts, len(time)][: len(aiding_ends)], strict=True
+    for hold_start, hold_end in zip(
+        aiding_ends, [*aiding_starts, len(time_s)][: len(aiding_ends)], strict=True
     ):
-        state[start:end, horizontal] = state[start - 1, horizontal]
-        state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
+        state[hold_start:hold_end, horizontal] = state[hold_start - 1, horizontal]
+        state[hold_start:hold_end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(model_run.reset[:, 0]):
         step = int(events.end_step[event])

@@ -202,7 +202,7 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
         update_rows["fused_at_s"] < len(track.time_us) - track.lag_steps
     ].iloc[1:]
     update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
-    innovation, variance, is_rejected, is_fused, rows = update_rows.to_numpy().T
+    innovation, innovation_variance, is_rejected, is_fused, rows = update_rows.to_numpy().T
     measured_s, steps = update_rows.index.to_numpy(), rows.astype(np.intp)
     measured_m = (
         heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)]
@@ -215,7 +215,7 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
             inputs.settings,
             track.timestamps(steps, measured_s),
             measured_m,
-            (innovation, variance, noise_variance),
+            (innovation, innovation_variance, noise_variance),
             (is_rejected > 0, is_fused > 0),
         )
     ]
@@ -232,7 +232,9 @@ def _magnetometer_topics(
     has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
     event_rows = track.logged_events(has_sample, end_step, OTHER_AIDS_HZ)
     rows = end_step[event_rows]
-    innovation, variance, fused_fraction = np.moveaxis(model_run.field[event_rows, :, 0], 1, 0)
+    innovation, innovation_variance, fused_fraction = np.moveaxis(
+        model_run.field[event_rows, :, 0], 1, 0
+    )
     observed_gauss = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
@@ -254,7 +256,7 @@ def _magnetometer_topics(
             settings,
             track.timestamps(rows),
             observed_gauss,
-            (innovation, variance, noise_variance),
+            (innovation, innovation_variance, noise_variance),
             (~is_fused, is_fused),
         ),
         topic(

@@ -157,11 +157,11 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, MAGNETOMETER_RATE_HZ)
-    rotation = attitude(motion.at(seconds(time_us))).body_to_ned
+    body_to_ned = attitude(motion.at(seconds(time_us))).body_to_ned
     # outdoors the measured field is rotated, which causes the heading error of EKF2
     if mistakes.heading_deg:
-        rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
-    field_gauss = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
+        body_to_ned = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ body_to_ned
+    field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
         field_gauss.shape
     )
@@ -176,8 +176,8 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
-    noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
-    height_m += SIGMA_BAROMETER_M * noise
+    unit_noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    height_m += SIGMA_BAROMETER_M * unit_noise
     return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
@@ -343,13 +343,13 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
             fix_us[is_logged], position_m[is_logged], velocity_m_s, reported_sigma, scenario
         )
     else:
-        rotation = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
+        body_to_ned = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
         topic = _odometry_topic(
             arrival_us[is_logged],
             timestamp_us[is_logged],
             position_m[is_logged],
             reported_sigma,
-            rotation,
+            body_to_ned,
         )
     return SimulatedPositions(
         topic=topic,
@@ -454,9 +454,9 @@ def _odometry_topic(
     sigma_m: float,
     body_to_ned: Array | None,
 ) -> Topic:
-    variance = np.full(position_m.shape, sigma_m**2)
+    variance_m2 = np.full(position_m.shape, sigma_m**2)
     fields = timestamps(timestamp_us, arrival_us - timestamp_us)
-    fields |= {"position": position_m, "position_variance": variance}
+    fields |= {"position": position_m, "position_variance": variance_m2}
     if body_to_ned is not None:
         fields["q"] = quaternions(body_to_ned)
     return topic("vehicle_visual_odometry", fields)

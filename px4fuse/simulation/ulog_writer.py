@@ -44,17 +44,17 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     known_fields |= TOPIC_FIELDS[table_row or name]
     unknown_fields = field_values.keys() - known_fields.keys()
     assert not unknown_fields, f"{name} has no {unknown_fields}"
-    count, fields = np.size(field_values["timestamp"]), {}
-    for field, row in known_fields.items():
-        kind, *default = row.split()
+    message_count, fields = np.size(field_values["timestamp"]), {}
+    for field, type_and_default in known_fields.items():
+        numpy_type, *default = type_and_default.split()
         if field in field_values:
             values = np.asarray(field_values[field])
-            values = values if values.ndim else np.full(count, values)
+            values = values if values.ndim else np.full(message_count, values)
         elif default:
-            values = np.full([count, *map(int, default[1:])], float(default[0]))
+            values = np.full([message_count, *map(int, default[1:])], float(default[0]))
         else:
             continue
-        fields[field] = values.astype(kind)
+        fields[field] = values.astype(numpy_type)
     return Topic(name, fields)
 
 
@@ -77,13 +77,17 @@ def encode(
     content += [_message("F", format_text.encode()) for format_text in formats]
     for name, info_value in info.items():
         if isinstance(info_value, str):
-            text = info_value.encode()
-            content.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
+            info_bytes = info_value.encode()
+            content.append(_keyed_message("I", f"char[{len(info_bytes)}] {name}", info_bytes))
         else:
             content.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
-    for name, value in parameters.items():
-        kind, struct_code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-        content.append(_keyed_message("P", f"{kind} {name}", struct.pack(struct_code, value)))
+    for name, parameter_value in parameters.items():
+        ulog_type, struct_code = (
+            ("int32_t", "<i") if isinstance(parameter_value, int) else ("float", "<f")
+        )
+        content.append(
+            _keyed_message("P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value))
+        )
     for topic_id, topic in enumerate(topics):
         content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
@@ -110,9 +114,9 @@ def _keyed_message(kind: str, key: str, value: bytes) -> bytes:
 def _format_text(topic: Topic) -> str:
     field_types = []
     for name, values in topic.fields.items():
-        size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
-        kind = _ULOG_TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
-        field_types.append(f"{kind}{size} {name};")
+        array_size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
+        ulog_type = _ULOG_TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
+        field_types.append(f"{ulog_type}{array_size} {name};")
     return f"{topic.name}:{''.join(field_types)}"
 
 

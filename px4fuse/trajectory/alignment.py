@@ -125,9 +125,13 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     y = reference_m - reference_m.mean(axis=0)
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # Umeyama eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Umeyama eq. 43
-    variance = float((x * x).sum() / len(x))  # Umeyama eq. 36
+    estimate_variance_m2 = float((x * x).sum() / len(x))  # Umeyama eq. 36
     # Umeyama eq. 42; a tiny variance would give an infinite scale
-    scale = float(d @ s / variance) if with_scale and variance > MIN_EXTENT_M**2 else 1.0
+    scale = (
+        float(d @ s / estimate_variance_m2)
+        if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2
+        else 1.0
+    )
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
     return _align_means(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
 

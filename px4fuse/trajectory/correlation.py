@@ -52,13 +52,13 @@ def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) 
     )
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)
-    count = np.rint(_correlate(mask_b, mask_a).real)
-    weight = 1.0 / np.maximum(count, 1.0)
+    common_count = np.rint(_correlate(mask_b, mask_a).real)
+    inverse_count = 1.0 / np.maximum(common_count, 1.0)
     sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
-    covariance = _correlate(b, a) - sum_a * sum_b * weight
-    power_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
-    power_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * weight
-    return Moments(count, covariance, power_a, power_b)
+    covariance = _correlate(b, a) - sum_a * sum_b * inverse_count
+    power_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
+    power_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
+    return Moments(common_count, covariance, power_a, power_b)
 
 
 def autocovariance(values: Array | Complex) -> Array:

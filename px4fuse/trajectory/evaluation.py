@@ -154,9 +154,9 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
-    reason, is_requested = "The user chose the alignment.", alignment is not None
+    alignment_reason, is_requested = "The user chose the alignment.", alignment is not None
     if alignment is None:
-        alignment, reason = choose_alignment(matched_estimate, matched_reference)
+        alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
     transform, line_warnings = _fit_or_approximate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
@@ -191,7 +191,7 @@ def evaluate(
         estimate_track=estimate,
         reference_track=reference,
         alignment=alignment,
-        alignment_reason=reason,
+        alignment_reason=alignment_reason,
         transform=transform,
         association=association_result,
         time_offset=time_offset,

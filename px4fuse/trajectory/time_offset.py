@@ -194,8 +194,10 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
     duration_s = float(trajectory.time_s[-1] - trajectory.time_s[0])
-    grid_s, velocity = _grid_velocity(trajectory, max(GRID_STEP_S, duration_s / MAX_GRID_SAMPLES))
-    return np.stack([np.interp(time_s, grid_s, column) for column in velocity.T], axis=1)
+    grid_s, velocity_m_s = _grid_velocity(
+        trajectory, max(GRID_STEP_S, duration_s / MAX_GRID_SAMPLES)
+    )
+    return np.stack([np.interp(time_s, grid_s, column) for column in velocity_m_s.T], axis=1)
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
@@ -204,10 +206,10 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     Also return a mask of the times outside of gaps.
     """
     time_s = trajectory.time_s
-    grid_s, velocity = _grid_velocity(trajectory, step_s)
+    grid_s, velocity_m_s = _grid_velocity(trajectory, step_s)
     # Speeds are interpolated between key frames, but not across gaps with lost tracking
     is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(trajectory.time_s), 0.5))
-    speeds = [np.linalg.norm(velocity, axis=1)]
+    speeds = [np.linalg.norm(velocity_m_s, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time_s, trajectory.rotation)(grid_s)
         rates_rad_s = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
@@ -311,17 +313,23 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
         or cross_information <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
     ):
         return float("inf")
-    score = (velocities[:, 0].reshape(pose_count, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
+    likelihood_score = (
+        velocities[:, 0].reshape(pose_count, 3) * (fit.target_m - fit.aligned_m)
+    ).sum(axis=1)
     # The window of the weights must be longer than the correlation
     lag_count = min(
-        max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), pose_count // 4
+        max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(likelihood_score)), pose_count // 4
     )
     weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
-    lagged_products = [float(score[k:] @ score[:-k]) for k in range(1, lag_count + 1)]
-    own_variance = float(score @ score)
-    variance = max(own_variance + 2.0 * float(weights @ lagged_products), own_variance)
+    lagged_products = [
+        float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
+    ]
+    uncorrelated_variance = float(likelihood_score @ likelihood_score)
+    score_variance = max(
+        uncorrelated_variance + 2.0 * float(weights @ lagged_products), uncorrelated_variance
+    )
     quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
-    return float(quantile * np.sqrt(variance) / information)
+    return float(quantile * np.sqrt(score_variance) / information)
 
 
 def _correlation_length(values: Array) -> int:

@@ -135,7 +135,11 @@ def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -
 
 
 def draw(
-    secret: bytes, student_id: str, kind: FlightKind, count: int | None = None, truth: bool = True
+    secret: bytes,
+    student_id: str,
+    kind: FlightKind,
+    mistake_count: int | None = None,
+    truth: bool = True,
 ) -> AssignedFlight:
     """Draw the flight of one student.
 
@@ -143,7 +147,7 @@ def draw(
     ----------
     kind : {"aisle", "loop", "mixed"}
         "mixed" draws aisle or loop.
-    count : int, optional
+    mistake_count : int, optional
         Number of injected faults; drawn at random by default.
     truth : bool
         True to log the ground truth of aisle flights. The log of a loop never contains it, because
@@ -155,23 +159,25 @@ def draw(
         One flight cannot have this many injected faults.
     """
     possible_kinds = MISTAKE_COUNT_FRACTIONS if kind == "mixed" else (kind,)
-    max_count = (
+    max_mistake_count = (
         min(len(MISTAKE_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
     )
-    if count is not None and not 0 <= count <= max_count:
+    if mistake_count is not None and not 0 <= mistake_count <= max_mistake_count:
         raise SettingsError(
-            f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
-            f"{max_count} detectable mistakes."
+            f"--mistakes {mistake_count} is out of range: a flight of kind {kind} has 0 to "
+            f"{max_mistake_count} detectable mistakes."
         )
     if kind == "mixed":
         kind = "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
-    if count is None:
-        count = bisect(list(accumulate(MISTAKE_COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
+    if mistake_count is None:
+        mistake_count = bisect(
+            list(accumulate(MISTAKE_COUNT_FRACTIONS[kind][:-1])), draw_number("count")
+        )
     mistakes: list[AssignableMistake] = []
     rules = RULES_BY_KIND[kind]
     for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):
-        if len(mistakes) < count and all(map(mistake.is_detectable_with, mistakes)):
+        if len(mistakes) < mistake_count and all(map(mistake.is_detectable_with, mistakes)):
             mistakes.append(mistake)
     difficulties, options = [], []
     for mistake in mistakes:

@@ -156,18 +156,18 @@ def draw_predictions(
     }
     predictions: list[tuple[Prediction, RangeName]] = []
     for change_text, changed_simulation in changed_simulations.items():
-        for name, summary in _compare(changed_simulation).main.filters.items():
+        for filter_name, summary in _compare(changed_simulation).main.filters.items():
             truth = summary.truth
-            values = {
+            value_by_quantity = {
                 "mean NIS": None if isinstance(summary, Unavailable) else summary.nis_mean,
                 "position RMSE against ground truth (m)": None
                 if isinstance(truth, Unavailable)
                 else truth.position_rmse_m,
             }
-            for quantity, value in values.items():
+            for quantity, value in value_by_quantity.items():
                 if value is None or not value > 0.0:
                     continue
-                text = f"{quantity} of {name.upper()} {change_text}"
+                text = f"{quantity} of {filter_name.upper()} {change_text}"
                 right_index = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
                 # keep the value away from the limits of the right range
                 value_index = right_index - 0.2 - 0.6 * draw_number(f"place {text}")
@@ -266,7 +266,10 @@ def quantity_truth(
     updates = kf_replay.updates.iloc[question.update - 1 :]
     if updates.empty:
         return None
-    row, covariance = updates.iloc[0], kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    update_row, covariance = (
+        updates.iloc[0],
+        kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS],
+    )
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
@@ -284,4 +287,4 @@ def quantity_truth(
             return float(nis.iloc[0])
         case "variance":
             return float(covariance.iloc[0])
-    return float(row["gain_position" if question.kind == "gain" else "innovation_m"])
+    return float(update_row["gain_position" if question.kind == "gain" else "innovation_m"])

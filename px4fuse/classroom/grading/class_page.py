@@ -166,11 +166,13 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
         )
         for item in report.items
     ]
-    named_texts = [
+    mistake_texts = [
         f"{name}: {'named' if is_named else 'not named'} in the answer form"
         for name, is_named in report.mistakes.items()
     ]
-    attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
+    attempts = [
+        f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
+    ]
     yield frame.list_section("Flags", entry.flags, is_warning=True)
     actions = [report.instructor_action] if report.instructor_action else []
     yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
@@ -181,7 +183,7 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     item_titles = ("Item", "Points", "Of", "Comment") if items else ()
     yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
-    yield frame.list_section("Injected faults of this flight", named_texts)
+    yield frame.list_section("Injected faults of this flight", mistake_texts)
     yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
     yield frame.list_section("Other attempts", attempts)

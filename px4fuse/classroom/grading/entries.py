@@ -343,13 +343,13 @@ def _apply_overrides(
     course: Course,
 ) -> Entry:
     """Apply the instructor's points and comments, compute the total, and add flags."""
-    report, total, flags = entry.counted_report, None, entry.flags
+    report, total_points, flags = entry.counted_report, None, entry.flags
     if report is not None:
         items = (_override_item(item, override_by_title.get(item.title)) for item in report.items)
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
-            total = round(max(report.points - entry.deduction, 0.0), 2)
+            total_points = round(max(report.points - entry.deduction, 0.0), 2)
     report_override, total_override = (
         override_by_title.get(title, Override()) for title in ("", TOTAL_TITLE)
     )
@@ -358,7 +358,7 @@ def _apply_overrides(
         counted_report=report,
         overrides=override_by_title,
         comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
-        total=total if total_override.points is None else total_override.points,
+        total=total_points if total_override.points is None else total_override.points,
         flags=flags,
     )
 
@@ -408,17 +408,19 @@ def read_overrides(path: Path) -> Overrides:
         student, item_title, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
-        value = parse_decimal(points)
+        parsed_points = parse_decimal(points)
         problem = ""
         if item_title in overrides[student]:
             item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
-        elif points and (value is None or value < 0.0 or not item_title):
+        elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
             points_text = one_line(points, 20)
             problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
-        overrides[student][item_title] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
+        overrides[student][item_title] = Override(
+            parsed_points, clean_text(comment[:MAX_COMMENT_LENGTH])
+        )
     return overrides
 
 
@@ -436,7 +438,7 @@ def match_overrides(
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
     max_points_of_reports = (report.max_points for entry in entries for report in entry.reports)
-    max_total = max(max_points_of_reports, default=math.inf)
+    max_total_points = max(max_points_of_reports, default=math.inf)
     people = Register(
         Person(entry.student_id, login=report.submission if report else "")
         for entry in entries
@@ -450,7 +452,7 @@ def match_overrides(
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        max_by_title = {TOTAL_TITLE: max_total, "": math.inf}
+        max_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := entries[student_index].counted_report:
             max_by_title |= {item.title: item.max_points for item in report.items}
             max_by_title[TOTAL_TITLE] = report.max_points
@@ -505,8 +507,8 @@ def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None =
     """
     words = text.split()
     try:
-        zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_zone
-        time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
+        time_zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_zone
+        due_time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
@@ -514,12 +516,12 @@ def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None =
         ) from error
     time_of_day = re.search(r"\d\d:\d\d(:\d\d)?", text)
     if time_of_day is None:
-        time = time.replace(hour=23, minute=59)
+        due_time = due_time.replace(hour=23, minute=59)
     if time_of_day is None or time_of_day[1] is None:
-        time = time.replace(second=59)
-    if time.tzinfo is not None:
-        return time
-    return time.replace(tzinfo=zone) if zone else time.astimezone()
+        due_time = due_time.replace(second=59)
+    if due_time.tzinfo is not None:
+        return due_time
+    return due_time.replace(tzinfo=time_zone) if time_zone else due_time.astimezone()
 
 
 def add_time_zone(time: datetime, due: datetime | None) -> datetime:

@@ -242,19 +242,19 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
     The fraction is 1 within the tolerance and 1/2 near it. It is 1/3 for a wrong sign, and if the
     form names another fault with this size.
     """
-    size = student_mistake.size_in_first_unit()
-    if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
+    named_size = student_mistake.size_in_first_unit()
+    if mistake.size is None or mistake.low is None or mistake.high is None or named_size is None:
         return 0.0
     if student_mistake.kind != mistake.kind:
         first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
-        is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
+        is_right = mistake.low <= named_size <= mistake.high and first_units[0] == first_units[1]
         return is_right / 3.0
-    deviation = abs(size - mistake.size) / abs(mistake.size)
+    deviation = abs(named_size - mistake.size) / abs(mistake.size)
     close_fraction = 0.5 * (deviation <= HALF_POINTS_SIZE_TOLERANCE)
     if mistake.kind in GUESSABLE_KINDS:
         tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
         close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
-    return _value_fraction(size, mistake.low, mistake.high, close_fraction)
+    return _value_fraction(named_size, mistake.low, mistake.high, close_fraction)
 
 
 def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
@@ -280,11 +280,12 @@ def correction_fraction(
     mistake: TrueMistake, student_mistake: StudentMistake, truth: FormTruth
 ) -> float:
     """Return the fraction of the points for a named correction and the value given with it."""
-    value = student_mistake.value_in_first_unit()
+    named_value = student_mistake.value_in_first_unit()
     fractions = [
         fraction
         if (low, high) == ANY_BOUNDS
-        else fraction * (0.5 if value is None else _value_fraction(value, low, high, 0.5))
+        else fraction
+        * (0.5 if named_value is None else _value_fraction(named_value, low, high, 0.5))
         for parameter, (low, high), fraction in accepted_corrections(mistake, truth)
         if parameter == student_mistake.parameter
     ]

@@ -278,7 +278,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
             report.pending_reason if report else "",
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
-            LIST_SEPARATOR.join(other.submission for other in entry.other_reports),
+            LIST_SEPARATOR.join(other_report.submission for other_report in entry.other_reports),
             LIST_SEPARATOR.join(report.verdict.reasons) if report else "",
             report.log_sha256 if report else "",
         ]
@@ -386,29 +386,36 @@ def fill_grades(
     format_feedback = (
         neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
     )
-    cells = [list(row) for row in sheet.rows]
+    cells_by_row = [list(row) for row in sheet.rows]
     names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
-    has_decimal_comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
+    has_decimal_comma = any(
+        re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
+    )
     notes, found_people = [], set()
-    for row in cells:
+    for row in cells_by_row:
         person = read_student(sheet, row)
         student_index = register.student_index(person) if person else None
         if student_index is None:
             continue
         found_people.add(student_index)
-        total, rubric_maximum = entries[student_index].total, entries[student_index].max_points
-        if total is None:
+        total_points, rubric_maximum = (
+            entries[student_index].total,
+            entries[student_index].max_points,
+        )
+        if total_points is None:
             continue
         if scale is not None and rubric_maximum:
-            total = round(total * scale / rubric_maximum, 2)
+            total_points = round(total_points * scale / rubric_maximum, 2)
         max_points = _platform_max_points(sheet, row, grade_index)
-        if max_points is not None and total > max_points:
+        if max_points is not None and total_points > max_points:
             notes.append(
-                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
-                f"maximum of {max_points:.10g} on the platform. Increase the maximum there, or run "
-                f"grade again with --scale {max_points:.10g}."
+                f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
+                f"the maximum of {max_points:.10g} on the platform. Increase the maximum there, or "
+                f"run grade again with --scale {max_points:.10g}."
             )
-        row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
+        row[grade_index] = format_cell_number(total_points).replace(
+            ".", "," if has_decimal_comma else "."
+        )
         if feedback_index is not None and feedback_index != grade_index:
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
@@ -421,7 +428,7 @@ def fill_grades(
             f"{sheet.path.name} has no row for {join_first(missing_names, 4)}. These grades were "
             "not entered."
         )
-    return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
+    return replace(sheet, rows=tuple(map(tuple, cells_by_row))), tuple(notes)
 
 
 def _platform_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:

@@ -331,22 +331,22 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
     """Read an entry of a zip file; reject types of entries that learning platforms do not write."""
     entry = archive.getinfo(name)
-    max_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
-    reason = ""
+    max_unpacked_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
+    rejection_reason = ""
     if entry.flag_bits & _ENCRYPTED_FLAG:
-        reason = "the zip entry is encrypted."
+        rejection_reason = "the zip entry is encrypted."
     elif stat.S_ISLNK(entry.external_attr >> 16):
-        reason = "the zip entry is a symbolic link."
+        rejection_reason = "the zip entry is a symbolic link."
     elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        reason = "the compression method of the zip entry is not supported."
+        rejection_reason = "the compression method of the zip entry is not supported."
     elif entry.file_size > MAX_PDF_BYTES:
-        reason = _TOO_LARGE_REASON
-    elif entry.file_size > max_bytes:
-        reason = (
+        rejection_reason = _TOO_LARGE_REASON
+    elif entry.file_size > max_unpacked_bytes:
+        rejection_reason = (
             f"the zip entry unpacks to more than {MAX_COMPRESSION_RATIO} times its packed size."
         )
-    if reason:
-        raise _EntryError(reason)
+    if rejection_reason:
+        raise _EntryError(rejection_reason)
     # zipfile returns at most the declared size
     return archive.read(entry)
 

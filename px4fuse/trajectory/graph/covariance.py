@@ -102,10 +102,10 @@ def _test_edge(
     graph: model.PoseGraph, edge_index: int, residual: Array, covariance: Array
 ) -> GateResult:
     vertices = int(graph.ids[graph.first[edge_index]]), int(graph.ids[graph.second[edge_index]])
-    directions, variance = model.information_eigenvectors(graph.information[edge_index])
-    degrees_of_freedom = len(variance)
+    directions, closure_variance = model.information_eigenvectors(graph.information[edge_index])
+    degrees_of_freedom = len(closure_variance)
     projected_residual = directions.T @ residual
-    residual_covariance = directions.T @ covariance @ directions + np.diag(variance)
+    residual_covariance = directions.T @ covariance @ directions + np.diag(closure_variance)
     is_testable = degrees_of_freedom and np.isfinite(residual_covariance).all()
     if (
         not is_testable

@@ -34,11 +34,11 @@ def initialise(graph: PoseGraph) -> PoseGraph:
 
 def _chordal(graph: PoseGraph) -> PoseGraph:
     """Fit rotation matrices and then translations, both by linear least squares."""
-    d = graph.dimension
-    rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
+    dimension = graph.dimension
+    rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
     model.require_connected(graph, rotation_information > 0.0, "edges that measure rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
-    eye = np.broadcast_to(np.eye(d), measured_rotation.shape)
+    eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
     # Minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
     relaxed_rotation = _solve_positions(
         graph,
@@ -52,12 +52,12 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first]
     axes = first_rotation @ measured_rotation
-    information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
-    translation = first_rotation @ graph.measurements[:, :d, None]
+    information = axes @ graph.information[:, :dimension, :dimension] @ axes.transpose(0, 2, 1)
+    translation = first_rotation @ graph.measurements[:, :dimension, None]
     position = _solve_positions(
-        graph, -eye, eye, information, translation, graph.poses[0, :d, None]
+        graph, -eye, eye, information, translation, graph.poses[0, :dimension, None]
     )[..., 0]
-    if d == 2:
+    if dimension == 2:
         poses = np.column_stack([position, np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])])
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])

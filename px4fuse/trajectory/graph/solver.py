@@ -90,17 +90,17 @@ def solve(
     """
     model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
     is_doubtful = ~graph.is_successive if is_closure is None else is_closure
-    start = model.residuals(graph, graph.poses)
-    cost_initial = 0.5 * float(np.sum(start.chi2))
+    start_residuals = model.residuals(graph, graph.poses)
+    cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
             "The pose graph contains a pose or measurement that is not finite or too large",
             "Correct the number, or remove the vertex or edge.",
         )
     weights = np.ones(len(is_doubtful))
-    minimum = _minimise(graph, start, weights)
+    minimum = _minimise(graph, start_residuals, weights)
     if robust and np.any(is_doubtful):
-        minimum, weights = _solve_gnc(graph, start, minimum, is_doubtful)
+        minimum, weights = _solve_gnc(graph, start_residuals, minimum, is_doubtful)
     return Solution(
         poses=minimum.state.poses,
         cost=0.5 * float(np.sum(weights * minimum.state.chi2)),
