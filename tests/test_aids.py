@@ -129,7 +129,7 @@ def test_samples_that_reset_ekf2_are_excluded_from_mean_nis() -> None:
     assert (aid.resets, aid.axes["north"].samples) == (2, evaluate(log).axes["north"].samples - 2)
 
 
-def test_innovation_gate_is_read_from_test_ratio_or_parameter() -> None:
+def test_ekf2_gate_is_computed_from_test_ratio_or_parameter() -> None:
     assert evaluate(aid_log(gate=3.0)).gate == pytest.approx(3.0)
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
@@ -150,7 +150,7 @@ def test_innovation_gate_is_read_from_test_ratio_or_parameter() -> None:
     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
     ("gnss_pos", {}, "the accuracy reported by the receiver"),
 ])  # fmt: skip
-def test_aiding_source_noise_states_the_parameter_that_sets_it(
+def test_aiding_source_report_names_its_noise_parameter(
     name: str, parameters: dict[str, float], set_by: str
 ) -> None:
     aid = evaluate(aid_log(**parameters), name)
@@ -159,7 +159,7 @@ def test_aiding_source_noise_states_the_parameter_that_sets_it(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_aiding_source_at_low_log_rate_has_a_longer_gap_limit() -> None:
+def test_gap_limit_of_aiding_source_increases_at_low_log_rate() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -168,7 +168,7 @@ def test_aiding_source_at_low_log_rate_has_a_longer_gap_limit() -> None:
         assert evaluate(replace(decimated, samples=samples)).verdict == verdict
 
 
-def test_aiding_source_findings_state_sensor_and_times() -> None:
+def test_aiding_source_fault_report_states_sensor_and_times() -> None:
     log = aid_log()
     with_gap = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
     found = evaluate_aids(with_aids(
@@ -206,7 +206,7 @@ def test_unfused_barometer_is_reported_only_with_height_error(
 
 
 @pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
-def test_height_error_below_three_rmse_in_a_gap_is_ignored(
+def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
     error_m: float, expected_m: float | None
 ) -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -275,7 +275,9 @@ def test_innovation_sign_is_the_same_for_each_px4_release(generation, tmp_path):
 # ---------------------------------------------------------------------------- reporting
 
 
-def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch, capsys) -> None:
+def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
+    tmp_path, monkeypatch, capsys
+) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_faulty]
@@ -284,13 +286,13 @@ def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_compare_checks_option_accepts_underconfident_sources(sigma: float, bad: bool) -> None:
+def test_compare_with_checks_option_accepts_too_large_noise(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
     assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
 
 
-def test_compare_without_position_evaluates_aiding_sources(tmp_path: Path) -> None:
+def test_compare_of_log_without_position_evaluates_other_sensors(tmp_path: Path) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     done = run("compare", log, "-o", report)
     assert "no external position" in done.output
@@ -310,7 +312,7 @@ def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None
     assert not (tmp_path / "a.pdf").exists()
 
 
-def test_find_aids_reports_changes_of_the_ekf2_instance() -> None:
+def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
     ekf2 = made(Ekf2, instances=((0.5, 0), (12.0, 1), (13.5, 0)))
     (finding,) = find_aids({}, ekf2)
     assert (finding.id, finding.evidence["count"]) == ("ekf2_instance_switch", 2)

@@ -151,7 +151,7 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 # -- the sample flight -----------------------------------------------------------------------------
 
 
-def test_align_sample_position_file_detects_frame_and_offset(
+def test_align_position_file_detects_frame_and_time_offset(
     sample_flight, external, true_offset_s
 ) -> None:
     alignment, track = align(sample_flight, external)
@@ -198,7 +198,7 @@ def test_align_position_file_recovers_clock_frame_and_yaw(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_align_position_file_sigma_equals_scatter_of_estimates() -> None:
+def test_align_position_file_sigma_equals_rms_of_true_errors() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
@@ -224,7 +224,7 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     assert alignment.frame_reason == "the column names of the position file show the frame"
 
 
-def test_align_position_file_on_45_degree_path_needs_frame() -> None:
+def test_align_position_file_on_diagonal_path_requires_frame() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
     file = uwb_file(flight, frame="enu")
     file.samples["z_m"] = np.nan
@@ -257,7 +257,7 @@ def test_align_position_file_rotates_its_variances(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_position_file_adds_its_positions_to_the_flight(flight: Flight) -> None:
+def test_align_position_file_adds_positions_to_flight_data(flight: Flight) -> None:
     result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
@@ -275,7 +275,7 @@ def test_align_position_file_adds_its_positions_to_the_flight(flight: Flight) ->
     (90.0, (0.0, 0.0, 0.0)), (-12.0, (1.0, 2.0, 0.0)), (180.0, (5.0, 0.0, 0.0)),
     (0.0, (2.0, 0.0, 0.0)),
 ])  # fmt: skip
-def test_align_position_file_of_misaligned_frame_warns(flight, yaw_deg, origin_m):
+def test_align_position_file_with_rotated_frame_gives_warning(flight, yaw_deg, origin_m):
     file = uwb_file(flight, yaw_deg=yaw_deg, origin_m=origin_m)
     alignment, _ = align(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
@@ -307,7 +307,7 @@ def test_align_position_file_in_wrong_unit_states_the_unit(
     assert remedy in str(refusal.value)
 
 
-def test_align_position_file_uses_given_clock_offset(flight: Flight) -> None:
+def test_align_position_file_applies_clock_offset_option(flight: Flight) -> None:
     wrong, _ = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The position file does not match the EKF2 position (correlation ")
@@ -319,7 +319,7 @@ def test_align_position_file_uses_given_clock_offset(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 0.1)
 
 
-def test_align_position_file_of_another_day_warns(flight: Flight) -> None:
+def test_align_position_file_of_another_day_gives_warning(flight: Flight) -> None:
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
     (day,) = align(other, uwb_file(flight), frame="enu")[0].warnings
     assert "file and log differ by 100 s" in day
@@ -328,7 +328,7 @@ def test_align_position_file_of_another_day_warns(flight: Flight) -> None:
 # -- outliers, gaps and resets ---------------------------------------------------------------------
 
 
-def test_align_position_file_is_robust_to_outliers_and_gap() -> None:
+def test_align_position_file_with_outliers_and_gap_finds_offset() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
     alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
     assert clock_error_s(alignment) < 0.03
@@ -440,7 +440,7 @@ def test_align_position_file_of_other_flight_is_rejected(flight: Flight) -> None
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
-def test_align_position_file_of_periodic_path_needs_offset(yaw: Any) -> None:
+def test_align_position_file_of_periodic_path_requires_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = uwb_file(flight)
     said = r"cannot be estimated: two time offsets that differ by [1-6]0\.\d s fit.*"

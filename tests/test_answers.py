@@ -96,7 +96,7 @@ def test_read_invalid_answer_form_names_line_in_one_line_error(
     assert "\n" not in str(error.value).replace("\\n", "")
 
 
-def test_answer_form_questions_depend_on_log_hash() -> None:
+def test_answer_form_questions_differ_for_each_log() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
@@ -114,7 +114,7 @@ def test_answer_form_questions_depend_on_log_hash() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_correct_answer_for_predicted_sigma_equals_closed_form() -> None:
+def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
@@ -135,7 +135,7 @@ def test_correct_answer_for_predicted_sigma_equals_closed_form() -> None:
 
 
 @pytest.mark.usefixtures("cached_analyses", "cached_pages")
-def test_compare_answers_option_adds_answer_form_to_report(
+def test_compare_with_answers_option_prints_answers_in_report(
     tmp_path: Path, sample_log: Path
 ) -> None:
     """``answers`` writes the form, ``compare`` reads it."""

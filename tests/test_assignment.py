@@ -79,13 +79,13 @@ def files(folder):
 
 
 class TestDraw:
-    def test_assigned_flights_of_equal_secret_and_id_are_equal(self):
+    def test_simulated_assignment_of_same_student_is_reproducible(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert simulate_assigned_flight(*given) == assignment.simulate_assigned_flight(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_assigned_flight_with_given_secret_equals_reference(self):
+    def test_simulated_assignment_with_known_secret_equals_reference(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -98,14 +98,14 @@ class TestDraw:
         assert loops == [1, 5, 9, 11]
 
     @pytest.mark.parametrize("kind", ["aisle", "loop", "mixed"])
-    def test_assigned_flights_of_other_students_or_secrets_differ(self, kind):
+    def test_simulated_assignments_of_two_students_differ(self, kind):
         drawn = [draw(SECRET, f"s{n}", kind).scenario for n in range(200)]
         drawn += [draw(b"another secret", f"s{n}", kind).scenario for n in range(200)]
         assert len({one.seed for one in drawn}) == 400
         assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
 
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
-    def test_assigned_flights_have_0_to_2_faults_as_configured(self, kind):
+    def test_simulated_assignments_contain_configured_fault_count(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
         for count, share in enumerate(MISTAKE_COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
@@ -113,13 +113,13 @@ class TestDraw:
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in RULES_BY_KIND[kind].mistakes}
 
-    def test_mixed_assignment_contains_aisle_and_loop_flights(self):
+    def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
-    def test_two_assigned_faults_are_compatible_and_in_range(self):
+    def test_two_faults_in_assigned_flight_are_compatible(self):
         signs = Counter()
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
@@ -146,7 +146,7 @@ class TestDraw:
         }
         assert {name for name, positive in signs if not positive} == both
 
-    def test_fault_size_limits_equal_smallest_detected_sizes(self):
+    def test_minimum_fault_size_equals_smallest_detected_size(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
@@ -165,7 +165,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_difficulties_of_assigned_flights_cover_their_range(self):
+    def test_assigned_flights_cover_full_range_of_difficulty(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90
@@ -174,7 +174,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_assigned_log_has_a_finding_for_each_fault_of_key(
+def test_each_fault_in_assigned_log_is_detected_by_analysis(
     tmp_path, monkeypatch, kind, number, count
 ):
     log, answer = assignment.simulate_assigned_flight(SECRET, CLASS[number], kind, count, True)
@@ -204,7 +204,7 @@ class TestAssign:
         made_up = iter([SECRET.decode()])
         monkeypatch.setattr(secrets, "token_urlsafe", lambda _: next(made_up))
 
-    def test_assign_flights_writes_logs_answer_forms_and_key(self, tmp_path):
+    def test_assign_flights_writes_logs_answer_forms_and_answer_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
         made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
         key = read_key(key_file)
@@ -224,7 +224,7 @@ class TestAssign:
         if os.name == "posix":
             assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
 
-    def test_assign_flights_again_keeps_files_and_adds_students(self, tmp_path):
+    def test_assign_flights_second_run_adds_only_new_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
@@ -252,7 +252,7 @@ class TestAssign:
             assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
-    def test_assign_flights_interrupted_run_is_continued(self, tmp_path, monkeypatch):
+    def test_assign_flights_rerun_after_interrupt_completes_files(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         flown = assignment.simulate_assigned_flight
 
@@ -268,7 +268,7 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_assign_flights_succeeds_after_unwritable_key_path(self, tmp_path):
+    def test_assign_flights_after_failed_key_write_can_be_repeated(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
@@ -361,7 +361,7 @@ class TestCommand:
         assert "0 logs written, 2 existed already" in run_checked("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
 
-    def test_simulate_without_secret_stores_one_in_the_key(self, at):
+    def test_simulate_without_secret_stores_new_secret_in_answer_key(self, at):
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
         assert "stored in the answer key" in kept

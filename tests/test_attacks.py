@@ -358,7 +358,7 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_grade_loop_flight_gives_expected_points_and_flags(name: str) -> None:
+def test_grade_of_loop_closure_report_gives_expected_points(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
     graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items

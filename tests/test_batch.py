@@ -469,7 +469,7 @@ def started_worker(address: str, log: Path, path: str) -> Any:
     return start_dask("worker", address, *local, says=says, log=log, PYTHONPATH=path)
 
 
-def test_batch_on_dask_cluster_gives_the_same_table(flights, undisturbed, tmp_path):
+def test_batch_on_dask_cluster_equals_local_batch(flights, undisturbed, tmp_path):
     """A scheduler and two workers; the scheduler is killed at the end."""
     path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
     ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")

@@ -71,7 +71,7 @@ OFFSET = Finding("source_time_offset", "error", "Timestamps are late.", "Subtrac
 NOISE = Finding("sigma_z_too_small", "error", "SIGMA_Z is too small.", "", {})
 
 
-def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
+def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
     flight = analysis(trial("noises", outcome(1.0, 1.0, 0.1)), trial("time offset", CORRECTED))
     ranked = rank_causes(flight, [NOISE, OFFSET])
     assert [(each.finding.id, each.tier) for each in ranked] == [
@@ -91,11 +91,11 @@ def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the σ ratio against the source becomes worse
     ],
 )
-def test_filter_rerun_improves_position_sigma_both_or_nothing(after, improves) -> None:
+def test_filter_rerun_result_states_if_rmse_or_sigma_improved(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
-def test_correction_without_improvement_is_not_recommended() -> None:
+def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
     helps, fails = trial("time offset", CORRECTED), trial("delay", FLOWN, owner="ekf2")
     (ranked,) = rank_causes(analysis(helps, fails), [OFFSET])
     cause = make_cause(analysis(helps, fails), ranked, (), REQUEST)
@@ -105,7 +105,7 @@ def test_correction_without_improvement_is_not_recommended() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_diagnosis_without_ground_truth_keeps_time_offset_cause() -> None:
+def test_diagnosis_without_ground_truth_still_lists_time_offset() -> None:
     """Innovations hardly show a time offset, so the re-run cannot refute it."""
     flight = analysis(trial("time offset", outcome(0.98), outcome(1.0)))
     (ranked,) = rank_causes(flight, [OFFSET])
@@ -116,7 +116,7 @@ def test_diagnosis_without_ground_truth_keeps_time_offset_cause() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_cause_with_improving_rerun_recommends_its_parameter() -> None:
+def test_filter_rerun_with_smaller_error_recommends_parameter() -> None:
     vibration = Finding("ekf2_overconfident", "error", "EKF2 is overconfident.", "Check.", {})
     helps = trial("process noise", CORRECTED, owner="ekf2")
     for trials, commands in (((helps,), ("param set EKF2_ACC_NOISE 0.7",)), ((), ())):
@@ -129,7 +129,7 @@ def test_cause_with_improving_rerun_recommends_its_parameter() -> None:
     assert rank_causes(analysis(fails), [vibration])[0].trials == ()
 
 
-def test_diagnosis_card_merges_equal_actions_for_kf_and_ekf2() -> None:
+def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     ratios = [(3.0, "overconfident")] * 4
     gap = Finding("source_gap", "warning", "No position for 8 s.", "Check the link.", {})
     flight = analysis()
@@ -140,7 +140,7 @@ def test_diagnosis_card_merges_equal_actions_for_kf_and_ekf2() -> None:
     ]  # fmt: skip
 
 
-def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
+def test_diagnosis_without_ground_truth_states_it_is_untested() -> None:
     ratios = verdicts(*[(1.0, "consistent")] * 4)
     untested = tuple(each for each in ratios if each.against == "source")
     (ranked,) = rank_causes(analysis(), [OFFSET])
@@ -155,7 +155,7 @@ def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
         assert cause.actions[-1] == Action("KF, EKF2", reason)
 
 
-def test_card_of_unreadable_log_shows_first_bytes_and_action(tmp_path) -> None:
+def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"\xa3\x95\x80\x01" * 300)
     with pytest.raises(LogError) as caught:
@@ -172,14 +172,14 @@ def test_card_of_unreadable_log_shows_first_bytes_and_action(tmp_path) -> None:
     assert missing.facts == {}
 
 
-def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:
+def test_diagnosis_of_clean_flight_advises_no_change(sample: Analysis) -> None:
     card = build_card(replace(sample, findings=()), REQUEST)
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"
     assert card.do_this == ("Change nothing.",)
 
 
-def test_card_explains_why_the_two_verdicts_on_ekf2_differ() -> None:
+def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
     flight = simulate_flight(Scenario(seed=8), parse_mistakes(("ekf2-delay=0.25",)))
     explained = explain(compare(flight, Settings()))
     card = build_card(explained, REQUEST)

@@ -30,7 +30,7 @@ def text_of(html: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]+>", " ", html)).split())
 
 
-def test_diagnosis_card_html_contains_all_fields() -> None:
+def test_diagnosis_html_contains_all_fields() -> None:
     text = text_of(card_html(SMALL_SIGMA_A))
     cause = SMALL_SIGMA_A.causes[0]
     for part in (
@@ -69,14 +69,14 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     ]
 
 
-def test_explained_verdict_in_diagnosis_card_html_is_not_bold() -> None:
+def test_diagnosis_html_shows_explained_verdict_without_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
     html = axis_html([one], "along the aisle")
     assert "loud" not in html
     assert "2.2, overconfident, explained" in html
 
 
-def test_diagnosis_card_html_escapes_text_from_logs() -> None:
+def test_diagnosis_html_escapes_text_from_logs() -> None:
     cause = structs.replace(
         SMALL_SIGMA_A.causes[0],
         title=HOSTILE,
@@ -100,7 +100,7 @@ def test_diagnosis_card_html_escapes_text_from_logs() -> None:
     assert {tag for tag, _ in Elements(html).found} <= allowed
 
 
-def test_diagnosis_card_of_rejected_log_has_no_sigma_ratio_plot() -> None:
+def test_diagnosis_of_rejected_log_has_no_sigma_ratio_plot() -> None:
     card = Card(
         severity="refused",
         id="not_px4",
@@ -115,7 +115,7 @@ def test_diagnosis_card_of_rejected_log_has_no_sigma_ratio_plot() -> None:
 
 
 @pytest.mark.usefixtures("cached_analyses")
-def test_comparison_in_notebook_displays_diagnosis_card(sample_log: Path) -> None:
+def test_compare_result_in_notebook_displays_diagnosis(sample_log: Path) -> None:
     analysis = px4fuse.compare(sample_log)
     html = analysis._repr_html_()
     assert html.startswith("<style>")
@@ -132,7 +132,7 @@ def structs_without_request(analysis: px4fuse.Analysis) -> px4fuse.Analysis:
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1000, "light"), (390, "dark")])
-def test_diagnosis_card_html_fits_phone_and_is_accessible(
+def test_diagnosis_html_fits_phone_and_is_accessible(
     browser: Browser, tmp_path: Path, width: int, scheme: str
 ) -> None:
     file = tmp_path / "card.html"

@@ -24,17 +24,17 @@ def text_of(card: Card) -> list[str]:
     ("ratio", "column", "mark"),
     [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
 )
-def test_sigma_ratio_text_plot_marks_ratio_at_its_column(ratio, column, mark) -> None:
+def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark) -> None:
     drawn = axis_text(ratio, "source")
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
-def test_text_axis_without_sigma_ratio_shows_consistent_band() -> None:
+def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
     assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
     assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
 
 
-def test_diagnosis_card_text_has_at_most_40_lines() -> None:
+def test_diagnosis_text_has_at_most_40_lines() -> None:
     lines = text_of(SMALL_SIGMA_A)
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 100
@@ -44,7 +44,7 @@ def test_diagnosis_card_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_card_text_joins_alternatives_by_either_or() -> None:
+def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)
@@ -58,7 +58,7 @@ def test_diagnosis_card_text_joins_alternatives_by_either_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
-def test_diagnosis_card_text_numbers_causes_and_counts_notes() -> None:
+def test_diagnosis_text_numbers_causes_and_counts_notes() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
     lines = text_of(card)
@@ -66,7 +66,7 @@ def test_diagnosis_card_text_numbers_causes_and_counts_notes() -> None:
     assert lines[-2:] == ["note[note_2]: Text 2.", "2 more notes are listed with -v"]
 
 
-def test_diagnosis_card_text_on_ascii_terminal_is_ascii() -> None:
+def test_diagnosis_text_on_ascii_terminal_is_ascii() -> None:
     four = verdicts((0.01, "underconfident"), (128.0, "overconfident"), *[(1.0, "consistent")] * 2)
     text = "\n".join(map(to_ascii, text_of(replace(SMALL_SIGMA_A, verdicts=four))))
     assert text.isascii()
@@ -75,7 +75,7 @@ def test_diagnosis_card_text_on_ascii_terminal_is_ascii() -> None:
     assert "<---" in text
 
 
-def test_diagnosis_card_commands_contain_the_typed_path() -> None:
+def test_commands_in_diagnosis_contain_log_path_as_typed() -> None:
     note = Note("x", "Text of aisle_uwb.ulg.", "Check it (px4fuse sync aisle_uwb.ulg).")
     card = replace(SMALL_SIGMA_A, notes=(note,), do_this=("Run px4fuse tune aisle_uwb.ulg.",))
     typed = with_typed_path(card, "my logs/aisle_uwb.ulg")

@@ -21,12 +21,12 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
     return Finding(name, severity, f"{name}.", "Do.", evidence)  # type: ignore[arg-type]
 
 
-def test_cause_table_contains_only_existing_finding_ids() -> None:
+def test_fault_table_contains_only_existing_fault_names() -> None:
     listed = {name for cause in CONSEQUENCES for name in effect_ids(cause)}
     assert listed | set(CONSEQUENCES) <= set(TITLES)
 
 
-def test_cause_table_lists_dependent_causes_before_root_causes() -> None:
+def test_fault_table_lists_consequences_before_their_causes() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
@@ -79,11 +79,11 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           ("aid_innovation_bias", "note", None)]),
     ],
 )  # fmt: skip
-def test_group_findings_lists_consequences_after_their_cause(given: Any, told: Any) -> None:
+def test_fault_report_lists_consequences_after_their_cause(given: Any, told: Any) -> None:
     assert [(each.id, each.severity, each.caused_by) for each in group_by_cause(given)] == told
 
 
-def test_consistency_notes_list_innovations_that_are_not_white(sample: Analysis) -> None:
+def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis) -> None:
     (white,) = verdict_notes(sample)
     assert format_verdict(sample.axes["aisle"].filters["kf"]) == "consistent"
     assert "Ljung-Box test, p < 0.001" in white

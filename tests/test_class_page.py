@@ -115,7 +115,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
 
 
-def test_class_page_matches_reference_file() -> None:
+def test_grades_page_html_equals_reference_file() -> None:
     text = class_page_html(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
@@ -124,7 +124,7 @@ def test_class_page_matches_reference_file() -> None:
 
 
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))
-def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
+def test_grades_page_escapes_html_in_student_text(text: str) -> None:
     def page(word: str) -> str:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
@@ -140,7 +140,7 @@ def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
     assert shape(made) == shape(page("x" if text else ""))
 
 
-def test_class_page_average_excludes_pending_points() -> None:
+def test_grades_page_mean_excludes_pending_points() -> None:
     said = {"Notes": Override(9.0, "Good.")}
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
                row("Cy", 12.0, instructor_action="Run 0.1.1."),
@@ -156,7 +156,7 @@ def test_class_page_average_excludes_pending_points() -> None:
                          ["13 / 20", 13.0, "changed by instructor"]]  # fmt: skip
 
 
-def test_class_page_shortens_long_text_and_omits_nan() -> None:
+def test_grades_page_shortens_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
     text = class_page_html([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
@@ -197,7 +197,7 @@ def anonymous_class() -> list[Entry]:
     return entries
 
 
-def test_class_page_in_anonymous_mode_contains_no_names() -> None:
+def test_grades_page_in_anonymous_mode_contains_no_names() -> None:
     text = class_page_html(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
@@ -235,7 +235,7 @@ HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "No
          "mean NIS", MARKUP)  # fmt: skip
 
 
-def test_class_page_filters_reports_by_text_and_status(page: Browser) -> None:
+def test_grades_page_filters_reports_by_text_and_status(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
     page.click("#text")
@@ -257,7 +257,7 @@ def test_class_page_filters_reports_by_text_and_status(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
+def test_grades_page_click_on_row_opens_report_details(page: Browser) -> None:
     page.click("tbody tr:first-child .name")
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
@@ -273,7 +273,7 @@ def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_keys_select_next_and_previous_report(page: Browser) -> None:
+def test_grades_page_keyboard_selects_next_and_previous_report(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
@@ -287,7 +287,7 @@ def test_class_page_keys_select_next_and_previous_report(page: Browser) -> None:
     assert page.ask(opened) == []
 
 
-def test_class_page_links_the_redrawn_report() -> None:
+def test_grades_page_links_report_redrawn_from_the_log() -> None:
     one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
     made = content(class_page_html([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
@@ -301,7 +301,7 @@ def test_points_histogram_has_counts_and_lower_bin_edges() -> None:
     ]
 
 
-def test_class_page_student_markup_is_shown_as_text(page: Browser) -> None:
+def test_grades_page_shows_markup_in_student_text_as_text(page: Browser) -> None:
     page.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
     named = [TURNED if one.student == REVERSED else one.display_name for one in CLASS]
     assert page.names() == named
@@ -324,7 +324,7 @@ def test_class_page_student_markup_is_shown_as_text(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_content_policy_blocks_images_and_requests(page: Browser) -> None:
+def test_grades_page_content_security_policy_blocks_requests(page: Browser) -> None:
     page.ask(
         "document.body.insertAdjacentHTML('beforeend',"
         ' \'<img src="http://127.0.0.1:9/x.png" onerror="window.alive=3">\')'
@@ -336,7 +336,7 @@ def test_class_page_content_policy_blocks_images_and_requests(page: Browser) -> 
     assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
-def test_class_page_downloads_points_and_comments_as_csv(page: Browser) -> None:
+def test_grades_page_downloads_points_and_comments_as_csv(page: Browser) -> None:
     page.ask("URL.createObjectURL = (one) => { window.table = one.text(); return '#'; }; 0")
     assert not page.ask("document.querySelector('#save').checkVisibility()")
     page.ask("document.querySelector('.list > tbody > tr .unfold').click()")

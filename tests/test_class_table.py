@@ -63,7 +63,7 @@ def may_be_formula(cell: str) -> bool:
 
 
 @given(texts)
-def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
+def test_grades_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
     made = class_table_csv([graded(text, {text: -3.25})])
     made.encode()
     for delimiter in (",", ";", "\t"):
@@ -74,7 +74,7 @@ def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> Non
 
 
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
-def test_class_table_csv_contains_neutralised_formulas(
+def test_grades_csv_contains_only_neutralised_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
     head, *rest = cells(class_table_csv([graded(text, numbers) for text, numbers in rows]))
@@ -126,7 +126,7 @@ def test_neutralise_csv_formulas_changes_only_formulas() -> None:
         assert neutralise_id(text) == text
 
 
-def test_class_table_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
+def test_grades_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
     made = class_table_csv([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
@@ -134,7 +134,7 @@ def test_class_table_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
     assert row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] == ["0.3", ""]
 
 
-def test_class_table_csv_lists_late_and_missing_students() -> None:
+def test_grades_csv_lists_late_and_missing_students() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)

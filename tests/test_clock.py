@@ -121,7 +121,7 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
-def test_motion_increments_equal_those_of_constant_acceleration() -> None:
+def test_integrated_imu_motion_equals_constant_acceleration() -> None:
     """Sideways acceleration s over dt gives s dt²/2 and s dt at every offset in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
@@ -274,7 +274,7 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
 # --- profiles and parts ---
 
 
-def test_time_offset_likelihood_parabola_gives_sigma() -> None:
+def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
     assert time_offset._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
@@ -290,7 +290,7 @@ def test_time_offset_likelihood_parabola_gives_sigma() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_of_flight_parts_maximises_likelihood(monkeypatch, offset_s) -> None:
+def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -356,7 +356,7 @@ def test_time_offset_from_insufficient_data_states_reason() -> None:
     assert "at least 30" in short.reason
 
 
-def test_clock_jump_and_drift_are_found_in_parts_of_a_flight() -> None:
+def test_clock_jump_and_drift_within_a_flight_are_detected() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
     assert found.change_p_value < MAX_CHANGE_P_VALUE
     for part in found.parts:
@@ -462,7 +462,7 @@ def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_is_kept_if_flight_parts_agree() -> None:
+def test_time_offset_interval_is_unchanged_if_flight_parts_agree() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

@@ -17,7 +17,7 @@ COORDINATE = st.floats(-50.0, 50.0)
 
 
 @given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
-def test_loop_correction_by_distance_equals_lesson_code(
+def test_loop_correction_proportional_to_distance_equals_formula(
     odom: list[tuple[float, float]],
 ) -> None:
     err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])
@@ -75,7 +75,7 @@ def test_heading_change_equals_rotation_about_vertical(yaw: float, x: float, y: 
     assert abs(closure.heading_change_rad(turn * tilt) - yaw) < 1e-9
 
 
-def test_convert_camera_frame_to_z_down_gives_frd() -> None:
+def test_camera_frame_positions_are_converted_to_frd() -> None:
     # one metre ahead, two to the right, three up of the first camera, looking right
     position = np.array([[0.0, 0.0, 0.0], [2.0, -3.0, 1.0], [2.0, -3.0, 1.5]])
     looking_right = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])  # about the camera's y, down
@@ -88,7 +88,7 @@ def test_convert_camera_frame_to_z_down_gives_frd() -> None:
     np.testing.assert_allclose(nose, [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_convert_enu_to_z_down_gives_ned() -> None:
+def test_enu_positions_are_converted_to_ned() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
     found = closure.to_z_down(replace(given, position_variance_m2=position**2))

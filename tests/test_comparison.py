@@ -123,7 +123,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_position_source_kind_determines_drift_and_gnss_flags(sample_flight: Flight) -> None:
+def test_position_source_of_kind_vio_is_treated_as_drifting(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -167,7 +167,7 @@ class TestSimulatedFlight:
             expected = [each(values) for values in (dp, dv) for each in statistics]
             assert list(asdict(result.difference).values())[1:] == pytest.approx(expected)
 
-    def test_kf_nees_does_not_depend_on_dt(self) -> None:
+    def test_kf_nees_does_not_depend_on_prediction_step_dt(self) -> None:
         """Variance and error have the same time, also between two steps."""
         flight = aisle_flight(uwb=Uwb(rate_hz=1.0))
         fine, coarse = (
@@ -188,7 +188,7 @@ class TestSimulatedFlight:
             assert one.nis_mean == pytest.approx(other.nis_mean)
             assert one.sigma_p_after_update_m == pytest.approx(other.sigma_p_after_update_m)
 
-    def test_compare_uses_given_settings_start_and_end(self, made: Comparison) -> None:
+    def test_compare_applies_noise_settings_and_time_range(self, made: Comparison) -> None:
         chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
         run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).main.replay
         assert run.settings == chosen

@@ -49,7 +49,7 @@ def test_white_innovations_have_verdict_consistent() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
-def test_sigma_ratio_follows_from_scale_of_innovation_variance(factor: float) -> None:
+def test_sigma_ratio_equals_inverse_root_of_variance_factor(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
     assert result.sigma_ratio == pytest.approx(factor**-0.5, rel=0.04)
@@ -60,7 +60,7 @@ def test_sigma_ratio_follows_from_scale_of_innovation_variance(factor: float) ->
     assert result.verdict == ("underconfident" if factor > 1 else "overconfident")
 
 
-def test_consistency_statistics_equal_their_formulas() -> None:
+def test_innovation_statistics_equal_their_formulas() -> None:
     nu, s = white(9, 60) + 0.2, np.linspace(0.5, 2.0, 60)
     result = assessed(nu, s)
     normalised = [n / math.sqrt(v) for n, v in zip(nu, s, strict=True)]
@@ -81,21 +81,21 @@ def test_consistency_statistics_equal_their_formulas() -> None:
     assert [result.bias_t, result.bias_p] == pytest.approx([student.statistic, student.pvalue])
 
 
-def test_larger_gate_reduces_fraction_outside_gate() -> None:
+def test_larger_gate_reduces_fraction_of_innovations_outside() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
     result = assess(nu, np.ones(20), gate=3.0)
     assert (result.fraction_outside_two_sigma, result.fraction_outside_gate) == (0.75, 0.5)
     assert assessed(nu).fraction_outside_gate == 0.25
 
 
-def test_consistency_test_ignores_nan_and_zero_variance() -> None:
+def test_nis_statistics_ignore_nan_and_zero_variance() -> None:
     nu, s = white(1, 50), np.ones(50)
     nu[3], s[7], s[9] = np.nan, 0.0, np.nan
     kept = np.delete(np.arange(50), [3, 7, 9])
     assert assess(nu, s) == assessed(nu[kept])
 
 
-def test_consistency_of_few_or_equal_innovations_is_unavailable() -> None:
+def test_nis_verdict_of_few_or_equal_innovations_is_unavailable() -> None:
     for count in (0, 1, 9):
         result = assess(white(1, count), np.ones(count))
         assert isinstance(result, Unavailable)
@@ -107,7 +107,7 @@ def test_consistency_of_few_or_equal_innovations_is_unavailable() -> None:
         assert "same value" in result.reason
 
 
-def test_horizontal_consistency_uses_mean_nis_of_both_axes() -> None:
+def test_horizontal_nis_is_mean_of_north_and_east_nis() -> None:
     north, east = white(1), 0.5 * white(2)
     result = assess_horizontal((north, np.ones(200)), (east, np.ones(200)))
     both = (assessed(north).nis_mean + assessed(east).nis_mean) / 2
@@ -118,7 +118,7 @@ def test_horizontal_consistency_uses_mean_nis_of_both_axes() -> None:
     assert result.verdict == "underconfident"
 
 
-def test_horizontal_consistency_of_few_samples_is_not_evaluated() -> None:
+def test_horizontal_nis_of_few_samples_is_not_evaluated() -> None:
     def axis(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return white(1, count), np.ones(count)
 
@@ -126,7 +126,7 @@ def test_horizontal_consistency_of_few_samples_is_not_evaluated() -> None:
     assert assess_horizontal((np.zeros(20), np.ones(20)), (np.zeros(20), np.ones(20))) is None
 
 
-def test_horizontal_consistency_ignores_nan_and_zero_variance() -> None:
+def test_horizontal_nis_ignores_nan_and_zero_variance() -> None:
     kept = np.delete(np.arange(200), 5)
     for column, value in ((0, np.nan), (1, np.nan), (1, 0.0)):
         north, east = (white(1), np.ones(200)), (white(2), np.ones(200))

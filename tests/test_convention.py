@@ -124,7 +124,7 @@ def assert_found(convention: Convention, **expected: object) -> None:
 
 
 @pytest.mark.parametrize("index", range(0, len(ALL_AXES), 5))
-def test_check_convention_finds_axes_unit_and_time_offset(index):
+def test_frame_detection_finds_axes_unit_and_time_offset(index):
     rng = np.random.default_rng(index)
     axes, unit = ALL_AXES[index], [*UNITS][index % 4]
     late_s = float(rng.uniform(-8.0, 8.0))
@@ -133,7 +133,7 @@ def test_check_convention_finds_axes_unit_and_time_offset(index):
 
 
 @pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 45.0, 100.0])
-def test_check_convention_finds_rotation_of_positions(rotation_deg):
+def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     found = check_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
     quarter = CLOCKWISE.index(found.x)
     assert not found.is_mirrored
@@ -142,12 +142,12 @@ def test_check_convention_finds_rotation_of_positions(rotation_deg):
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
-def test_check_convention_finds_clock_drift(clock_drift):
+def test_frame_detection_finds_clock_drift_of_source(clock_drift):
     found = check_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
     assert_found(found, clock_drift=clock_drift)
 
 
-def test_check_convention_of_correct_source_is_ned_in_metres():
+def test_frame_detection_of_ned_positions_gives_ned_and_metres():
     track = flown().positions[0]
     found = check_convention(flown(), track)
     assert_found(found)
@@ -156,28 +156,28 @@ def test_check_convention_of_correct_source_is_ned_in_metres():
     assert found.scale == pytest.approx(1.0, abs=0.1)  # odometry drifts
 
 
-def test_check_convention_of_pure_noise_is_not_determinable():
+def test_frame_detection_on_pure_noise_is_undetermined():
     track = sent(flown())
     noise = np.random.default_rng(2).normal(0.0, 0.3, (len(track.samples), 3))
     samples = track.samples.assign(**dict(zip(Columns.POSITION, noise.T, strict=True)))
     assert check_convention(flown(), replace(track, samples=samples)).verdict == "not determinable"
 
 
-def test_check_convention_omits_repeated_positions():
+def test_frame_detection_ignores_repeated_positions():
     track = sent(flown())
     samples = track.samples.copy()
     samples.iloc[200:260] = samples.iloc[199].to_numpy()
     assert_found(check_convention(flown(), replace(track, samples=samples)))
 
 
-def test_check_convention_without_height_finds_axes():
+def test_frame_detection_without_height_finds_horizontal_axes():
     track = sent(flown())
     samples = track.samples.assign(down_m=np.nan)
     assert_found(check_convention(flown(), replace(track, samples=samples)))
 
 
 @pytest.mark.parametrize("frames", ["ENU", "NWU"])
-def test_check_convention_finds_ros_frames_of_orientation(frames):
+def test_frame_detection_finds_ros_frames_of_orientation(frames):
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
     track = with_orientation(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
@@ -187,7 +187,7 @@ def test_check_convention_finds_ros_frames_of_orientation(frames):
 
 
 @pytest.mark.parametrize("error_deg", [-90.0, 45.0, 180.0])
-def test_check_convention_finds_heading_error_of_orientation(error_deg):
+def test_frame_detection_finds_heading_error_of_orientation(error_deg):
     time, attitude = oriented(flown())
     track = with_orientation(sent(flown()), multiply(yaw(error_deg), attitude), time)
     found = check_convention(flown(), track).orientation
@@ -196,12 +196,12 @@ def test_check_convention_finds_heading_error_of_orientation(error_deg):
     assert difference == pytest.approx(0.0, abs=3.0)
 
 
-def test_check_convention_finds_quaternion_order_with_w_last():
+def test_frame_detection_finds_quaternion_order_x_y_z_w():
     found = check_convention(flown(), w_last(flown())).orientation
     assert (found.verdict, found.order) == ("determined", "x y z w")
 
 
-def test_check_attitude_copied_from_ekf2_is_detected():
+def test_orientation_copied_from_ekf2_is_detected():
     assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
 
 
@@ -258,13 +258,13 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), FAULTS)
-def test_faulty_source_convention_is_the_only_finding(name, kind):
+def test_wrong_axes_unit_or_time_offset_is_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 
 
 @pytest.mark.parametrize("name", [name for name, _ in FAULTS if "orientation" not in name])
-def test_compare_corrects_positions_with_wrong_convention(name):
+def test_compare_converts_positions_in_wrong_frame_to_ned(name):
     track = next(FAULTS[one](flown()) for one in FAULTS if one[0] == name)
     samples, truth = compared(track).source.samples, flown().truth.samples
     error = [
@@ -280,12 +280,12 @@ def test_compare_ignores_orientation_copied_from_ekf2():
     assert source.origin.kind == "uwb"
 
 
-def test_clean_position_source_has_no_convention_finding():
+def test_positions_in_correct_ned_frame_give_no_frame_fault():
     assert not list(source_convention.detect(prepare(flown())))
     assert not list(source_convention.detect(compared(sent(flown()))))
 
 
-def test_enu_orientation_finding_of_ned_source_names_conversion():
+def test_enu_orientation_report_states_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
     (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
@@ -306,7 +306,7 @@ def fused(flight: Flight) -> Flight:
     ),
     (("west", "north", "down"), -32.0, Faults()),
 ])  # fmt: skip
-def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_deg, expected):
+def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg, expected):
     convention = Convention(
         verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
@@ -315,14 +315,14 @@ def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_de
     assert convention_faults(convention, fused(flown()), "NED") == expected
 
 
-def test_source_in_frame_frd_has_no_rotation_fault():
+def test_positions_in_frd_frame_have_no_yaw_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
     assert not convention_faults(convention, flown(), "FRD")
     assert convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])
-def test_refined_delay_below_the_limit_keeps_the_finding(estimate_s, reported_s):
+def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_s):
     late = Convention(verdict="determined", late_s=0.52)
     comparison = replace(compared(sent(flown())), convention=late)
     clock = ClockOffset(
@@ -336,7 +336,7 @@ def test_refined_delay_below_the_limit_keeps_the_finding(estimate_s, reported_s)
     assert refine_delay(comparison, unclear) is comparison
 
 
-def test_ambiguous_source_axes_finding_lists_possible_axes():
+def test_ambiguous_position_axes_report_lists_possible_axes():
     (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
     assert found.id == "source_convention_ambiguous"
     assert "rotated by +12°" in found.message
@@ -346,7 +346,7 @@ def test_ambiguous_source_axes_finding_lists_possible_axes():
     (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
     (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
 ])  # fmt: skip
-def test_position_file_in_wrong_frame_finding_names_the_frame(axes, message, remedy):
+def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, remedy):
     """The axes are those of positions that were converted from ENU."""
     alignment = replace(given_placement(), frame="enu")
     (found,) = source_convention.detect(compared(replace(sent(flown(), axes), alignment=alignment)))
@@ -354,7 +354,7 @@ def test_position_file_in_wrong_frame_finding_names_the_frame(axes, message, rem
     assert remedy in found.remedy
 
 
-def test_ekf2_findings_are_consequences_of_wrong_source_axes():
+def test_ekf2_faults_are_reported_as_effects_of_wrong_axes():
     comparison = compared(sent(flown(), ENU))
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
@@ -366,7 +366,7 @@ def test_ekf2_findings_are_consequences_of_wrong_source_axes():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
-def test_check_convention_of_sitl_log_equals_known_convention(name):
+def test_frame_detection_on_sitl_log_finds_known_frame(name):
     flight = read_log(shared("logs/conventions") / f"{name}.ulg")
     found = check_convention(flight, flight.positions[0])
     expected = dict(FLOWN[name])
@@ -377,7 +377,7 @@ def test_check_convention_of_sitl_log_equals_known_convention(name):
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_check_convention_of_test_case_equals_expectation(name):
+def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     file, expected = CASES[name]
     flight = read_log(shared("cases") / file)
     track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")

@@ -9,7 +9,7 @@ from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
-def test_cross_correlation_moments_equal_sums_at_each_lag(is_complex: bool) -> None:
+def test_cross_correlation_equals_direct_sum_at_each_lag(is_complex: bool) -> None:
     rng = np.random.default_rng(3)
     a, b = rng.normal(5.0, 1.0, 7), rng.normal(-3.0, 2.0, 11)
     if is_complex:

@@ -55,7 +55,7 @@ def eventful() -> Analysis:
     return with_noises(compare(flight))
 
 
-def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
+def test_report_cover_prints_texts_of_the_diagnosis() -> None:
     text = text_of(SMALL_SIGMA_A)
     cause = SMALL_SIGMA_A.causes[0]
     expected = [
@@ -96,13 +96,13 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
      ("effect_text", ""), ("verdicts", ())],
 )  # fmt: skip
-def test_report_cover_has_no_space_for_an_empty_row(field: str, empty: Any) -> None:
+def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
-def test_explained_verdict_on_report_cover_is_not_bold() -> None:
+def test_report_cover_shows_explained_verdict_without_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -144,7 +144,7 @@ def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     assert "this is usual and not a fault" in text
 
 
-def test_report_cover_right_to_left_name_precedes_the_id() -> None:
+def test_report_cover_prints_right_to_left_name_before_id() -> None:
     name = "محمد"
     identity = replace(SMALL_SIGMA_A.identity, student=name, student_id="s123")
     text = text_of(replace(SMALL_SIGMA_A, identity=identity))
@@ -192,7 +192,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_cover_map_title_states_distance_of_track_outside() -> None:
+def test_report_cover_map_title_states_distance_outside_map() -> None:
     flight = aisle_flight(duration_s=60.0)
     flight.ekf2.state.loc[30.0:31.0, "east_m"] += 40.0
     analysis = unexplained(compare(flight))

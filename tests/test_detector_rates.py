@@ -36,12 +36,12 @@ def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_simulated_fault_is_first_finding_on_95_percent_of_logs(finding) -> None:
+def test_simulated_fault_is_first_reported_on_95_percent_of_logs(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_faults_listed_as_undetectable_are_found_below_10_percent() -> None:
+def test_undetectable_faults_are_detected_in_under_10_percent() -> None:
     for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
@@ -49,13 +49,13 @@ def test_faults_listed_as_undetectable_are_found_below_10_percent() -> None:
         assert row.rate <= 0.1
 
 
-def test_clock_jump_is_found_despite_rounding_of_likelihood() -> None:
+def test_clock_jump_is_detected_despite_rounded_likelihood() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
-def test_faults_with_detection_rate_100_percent_are_found() -> None:
+def test_faults_with_100_percent_detection_rate_are_detected() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_faults_with_detection_rate_100_percent_are_found() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_detection_rate_table_counts_first_and_other_findings() -> None:
+def test_detection_rate_table_counts_first_and_other_reports() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(
@@ -81,6 +81,6 @@ def test_detection_rate_table_counts_first_and_other_findings() -> None:
     assert set(made["scenario"]) == {DEFAULT}
 
 
-def test_lag_of_ekf2_output_predictor_gives_no_finding():
+def test_ekf2_output_predictor_lag_is_not_reported_as_fault():
     """At 10 Hz and 0.05 m the published position errs by 2 σ, at the fusion horizon by 1 σ."""
     assert found(1, clean("10 Hz, 0.05 m, yaw follows")) == ()

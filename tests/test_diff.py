@@ -144,7 +144,7 @@ def test_diff_with_larger_nis_but_same_verdict_is_not_worse(clean):
         assert list_changes(after, after).worse == ()
 
 
-def test_diff_with_new_error_finding_is_reported_as_worse(clean):
+def test_diff_with_additional_fault_is_reported_as_worse(clean):
     late = flown(505, "clock-offset=0.25")
     errors = {one.id for one in late.results.findings if one.severity == "error"}
     assert errors
@@ -161,7 +161,7 @@ def test_diff_with_new_error_finding_is_reported_as_worse(clean):
 # -- the list of measures --------------------------------------------------------------------------
 
 
-def test_diff_numbers_have_unique_json_paths_and_intervals(clean):
+def test_diff_compares_each_json_number_only_once(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
     found = collect_numbers(clean.results)

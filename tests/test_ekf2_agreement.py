@@ -102,7 +102,7 @@ def agreeing(
     (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
     (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
 ])  # fmt: skip
-def test_ekf2_replay_agreement_verdict_changes_at_its_limits(
+def test_ekf2_replay_agrees_if_differences_are_below_limits(
     axis, logged, replayed_share, good, expected
 ):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
@@ -159,7 +159,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_constant_velocity_innovations_have_no_correlation():
+def test_correlation_of_constant_innovations_is_unavailable():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
@@ -170,7 +170,7 @@ def test_constant_velocity_innovations_have_no_correlation():
     assert _compare_velocity(ekf2, replay, is_own_topic=True) == CONSTANT_INNOVATIONS
 
 
-def test_heading_error_without_logged_state_is_none():
+def test_ekf2_replay_heading_error_without_logged_state_is_none():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
     replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, evaluated_s=((5.0, 9.0),))
@@ -234,7 +234,7 @@ def test_ekf2_replay_agreement_without_state_is_unavailable():
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_logged_innovations_without_one_axis_give_empty_table():
+def test_ekf2_innovations_of_only_one_axis_are_not_used():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(

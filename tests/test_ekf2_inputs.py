@@ -190,7 +190,7 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
-def test_ekf2_replay_selects_the_complete_vision_track(tracks, expected):
+def test_ekf2_replay_selects_the_most_complete_vision_topic(tracks, expected):
     found = _vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
@@ -263,7 +263,7 @@ def test_logged_rejections_are_matched_by_measurement_time():
         assert not reset.any()
 
 
-def test_logged_decisions_follow_from_time_of_last_fusion():
+def test_logged_fusion_is_derived_from_time_of_last_fusion():
     """Rows at 0.5 and 1 s of samples at 10 Hz; EKF2 fused at 0.2 s and reset its position at 1.3 s.
 
     Inertial dead reckoning lasts from 1.2 s, which is 1 s after the last fusion, to 1.3 s.
@@ -305,7 +305,7 @@ def test_logged_decisions_follow_from_time_of_last_fusion():
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_ekf2_prediction_step_ends_after_sample_count_or_time(interval_ms, known, ends):
+def test_ekf2_prediction_step_ends_after_imu_count_or_time(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 

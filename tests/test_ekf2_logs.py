@@ -62,7 +62,7 @@ REJECTING_FLIGHTS = {
 
 
 @pytest.mark.parametrize("name", REJECTING_FLIGHTS)
-def test_ekf2_replay_of_flights_with_rejections_agrees(shared_logs, name):
+def test_ekf2_replay_of_flights_with_rejections_agrees_with_log(shared_logs, name):
     model = open_model(read_log(shared_logs / f"{name}.ulg"))
     assert not isinstance(model, Unavailable)
     assert model.agreement.good
@@ -70,7 +70,7 @@ def test_ekf2_replay_of_flights_with_rejections_agrees(shared_logs, name):
     assert min(correlations) > REJECTING_FLIGHTS[name]
 
 
-def test_ekf2_replay_of_mirrored_flight_is_refused(shared_logs):
+def test_ekf2_replay_with_86_percent_rejected_does_not_agree(shared_logs):
     """EKF2 rejects 86 % of the positions, and its variance is reduced by unlogged samples."""
     model = open_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
     assert not isinstance(model, Unavailable)
@@ -88,7 +88,7 @@ def test_ekf2_replay_of_mirrored_flight_is_refused(shared_logs):
         ("g1_base", {}),
     ],
 )
-def test_whatif_of_flown_flight_proposes_the_wrong_parameter(shared_logs, name, expected):
+def test_what_if_on_faulty_flight_corrects_the_wrong_parameter(shared_logs, name, expected):
     log = str(shared_logs / "flown" / f"{name}.ulg")
     found = run_what_if(WhatIfRequest(log=log)).changes
     assert found == pytest.approx(expected, abs=20.0 if "d0" in name else 0.01)

@@ -63,7 +63,7 @@ def test_attitude_variance_equals_variance_of_sampled_angles(read):
     assert found == pytest.approx(errors.var(axis=0), rel=0.02)
 
 
-def test_read_ekf2_record_keeps_all_ekf2_parameters(read, tmp_path):
+def test_read_log_keeps_all_ekf2_parameters(read, tmp_path):
     log = made_log("v1.16")
     kept = {name: value for name, value in log.parameters.items() if name.startswith("EKF2_")}
     assert read(log).ekf2.record.parameters == pytest.approx(kept)
@@ -75,7 +75,7 @@ def test_read_ekf2_record_keeps_all_ekf2_parameters(read, tmp_path):
     ("cs_opt_flow", ("optical flow",)),
     ("cs_ev_vel", ("vision velocity",)),
 ])  # fmt: skip
-def test_read_ekf2_record_lists_other_aiding_sources(read, flag, names):
+def test_read_log_lists_all_ekf2_aiding_sources(read, flag, names):
     log = made_log("v1.16")
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)

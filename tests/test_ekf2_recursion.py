@@ -182,7 +182,7 @@ def test_ekf2_position_is_reset_to_gnss_after_7_or_14_s(
     assert (taken, reset) == (False, resets)
 
 
-def test_ekf2_sequential_update_uses_initial_innovations():
+def test_ekf2_sequential_update_uses_innovations_before_update():
     """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
@@ -210,7 +210,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_tilt_variance_of_gnss_replay_is_at_most_the_logged_one():
+def test_ekf2_replay_tilt_variance_is_limited_to_logged_value():
     """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
@@ -355,7 +355,7 @@ def at_rest(
     return run_segment(inputs, segment, [configuration], [intervals])
 
 
-def test_new_reset_counter_resets_position_to_sample():
+def test_new_vision_reset_counter_resets_ekf2_position():
     """The source jumps by 0.3 m, inside the gate, and announces it at 10.605 s."""
     done = at_rest([0.0] * 5 + [0.3] * 15, reset_s=np.array([10.605]))
     assert np.flatnonzero(done.reset[:, 0]).tolist() == [5]

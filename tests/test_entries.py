@@ -55,7 +55,7 @@ THREE = {
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_attempt_option_selects_the_graded_report(attempt, points) -> None:
+def test_grade_attempt_option_selects_the_report_that_counts(attempt, points) -> None:
     (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counted_report.points == ada.total == points
     assert len(ada.other_reports) == 2
@@ -63,7 +63,7 @@ def test_attempt_option_selects_the_graded_report(attempt, points) -> None:
     assert (grace.counted_report, grace.total, grace.max_points) == (None, None, 10.0)
 
 
-def test_class_entry_of_late_report_has_points_deducted() -> None:
+def test_grade_of_late_report_has_points_deducted() -> None:
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
@@ -88,13 +88,13 @@ def test_class_entry_of_late_report_has_points_deducted() -> None:
         ),
     ],
 )
-def test_class_entry_late_deduction_stops_at_zero_points(due, rule, late_s, off) -> None:
+def test_grade_of_very_late_report_is_not_below_zero(due, rule, late_s, off) -> None:
     (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
 
-def test_zip_entry_time_orders_reports_but_deducts_no_points() -> None:
+def test_grade_uses_zip_entry_time_only_to_order_reports() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
@@ -117,20 +117,20 @@ def test_zip_entry_time_orders_reports_but_deducts_no_points() -> None:
         ("2026-11-22", 0.0, 0.0),
     ],
 )
-def test_class_entry_extension_and_grace_reduce_the_delay(extension, grace_s, late_s) -> None:
+def test_due_date_extension_and_grace_period_reduce_lateness(extension, grace_s, late_s) -> None:
     term = Course(RUBRIC, due=DUE, grace_s=grace_s, late_rule=parse_late_rule("10%/day"))
     people = (replace(PEOPLE[0], extended_due=extension), *PEOPLE[1:])
     (ada, _), _ = make_entries(THREE, term, people=people)
     assert (ada.late_s, ada.deduction > 0.0) == (late_s, late_s > 0.0)
 
 
-def test_class_entry_with_invalid_extension_names_the_student() -> None:
+def test_invalid_due_date_extension_error_names_the_student() -> None:
     people = (replace(PEOPLE[0], extended_due="two days"), *PEOPLE[1:])
     with pytest.raises(SettingsError, match=r"extension of .*'two days' is not a valid time"):
         make_entries(THREE, Course(RUBRIC, due=DUE), people=people)
 
 
-def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
+def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
     essay = replace(
         graded_report("", 0.0), version="", verdict=Verification("cannot verify", ("x",), False)
     )
@@ -148,7 +148,7 @@ def of_form(points: float, kind: str, **more):
     return replace(graded_report("", points, student_id="1"), form=form, **more)
 
 
-def test_class_entry_with_differing_answer_forms_is_pending() -> None:
+def test_grade_with_two_different_answer_forms_is_pending() -> None:
     """None of the files submitted together counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
@@ -164,7 +164,7 @@ def test_class_entry_with_differing_answer_forms_is_pending() -> None:
     assert ada.total == 4.0
 
 
-def test_pending_report_does_not_replace_the_graded_report() -> None:
+def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     """For example a later report of another student with this student's id."""
     files = {
         "a.pdf": of_form(9.0, "yaw"),
@@ -184,7 +184,7 @@ def test_pending_report_does_not_replace_the_graded_report() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_file_name_that_imitates_platform_names_is_flagged() -> None:
+def test_submission_name_that_imitates_platform_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_entries({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
@@ -194,7 +194,7 @@ def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     )
 
 
-def test_best_report_of_one_attempt_is_graded() -> None:
+def test_grade_with_several_reports_in_attempt_uses_best() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -212,7 +212,7 @@ def test_learning_platform_id_overrides_id_in_report() -> None:
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
 
 
-def test_student_outside_class_list_has_flagged_entry() -> None:
+def test_student_missing_in_class_list_is_flagged() -> None:
     files = {
         "report.pdf": graded_report("", 8.0, student="Mallory", student_id="9"),
         "other.pdf": graded_report("", 3.0, student="lovelace ADA"),
@@ -223,7 +223,7 @@ def test_student_outside_class_list_has_flagged_entry() -> None:
     assert stranger.flags[0] == "The student is not in the class list."
 
 
-def test_class_entries_without_roster_list_each_student_once() -> None:
+def test_grades_without_class_list_have_one_row_per_student() -> None:
     files = {
         "Doe Jane_5_assignsubmission_file_/a.pdf": graded_report(
             "", 1.0, student="Jane", student_id="42"
@@ -296,7 +296,7 @@ def test_instructor_override_above_maximum_points_gives_a_note(
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_overrides_of_class_page_include_all_students(tmp_path) -> None:
+def test_grades_download_includes_students_without_report(tmp_path) -> None:
     """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
@@ -310,7 +310,7 @@ def test_overrides_of_class_page_include_all_students(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_total_points_from_instructor_end_pending_status(tmp_path) -> None:
+def test_instructor_total_points_end_pending_status(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", instructor_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
@@ -328,7 +328,7 @@ def test_instructor_override_without_submission_gives_points(tmp_path) -> None:
     assert (grace.total, len(notes)) == (None, 1)
 
 
-def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
+def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
     rows = write_overrides(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
 
@@ -344,7 +344,7 @@ def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )
-def test_read_overrides_with_invalid_row_raises_error(tmp_path, row, says) -> None:
+def test_instructor_overrides_csv_invalid_row_raises_error(tmp_path, row, says) -> None:
     with pytest.raises(SettingsError, match=says):
         write_overrides(tmp_path, row)
     with pytest.raises(SettingsError, match="no column comment"):
@@ -423,7 +423,7 @@ def test_parse_moodle_time_accepts_english_german_and_iso_dates(text: str) -> No
     assert parse_moodle_time(text) == datetime(2026, 11, 20, 23, 58)
 
 
-def test_read_overrides_with_unquoted_comma_names_the_row(tmp_path: Path) -> None:
+def test_instructor_overrides_csv_unquoted_comma_names_row(tmp_path: Path) -> None:
     path = tmp_path / "overrides.csv"
     path.write_text("id,item,points,comment\n0001,,,Good, but late\n", encoding="utf-8")
     with pytest.raises(SettingsError, match="row 2 has more cells than the header"):

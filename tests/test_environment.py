@@ -44,7 +44,9 @@ def test_info_command_ignores_invalid_source_date_epoch(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
-def test_output_ignores_invalid_columns_environment_variable(monkeypatch, capsys, columns) -> None:
+def test_terminal_output_with_invalid_columns_variable_succeeds(
+    monkeypatch, capsys, columns
+) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     usual = run_main(monkeypatch, capsys, "info", LOG)
     monkeypatch.setenv("COLUMNS", columns)
@@ -52,7 +54,7 @@ def test_output_ignores_invalid_columns_environment_variable(monkeypatch, capsys
     assert usual[1].startswith(LOG.name)
 
 
-def test_terminal_output_ignores_columns_variable_of_zero(monkeypatch, capsys) -> None:
+def test_info_command_with_columns_0_prints_the_log_name(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "0")
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     code, out, _ = run_main(monkeypatch, capsys, "info", LOG)
@@ -81,7 +83,7 @@ def test_command_under_small_memory_limit_reports_the_limit(tmp_path) -> None:
     assert contents(tmp_path) == {}
 
 
-def test_exhausted_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -> None:
+def test_command_out_of_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -> None:
     from px4fuse import diagnose
 
     def exhausted(*_: object) -> None:

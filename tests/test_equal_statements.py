@@ -15,12 +15,12 @@ LOGS = (
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", LOGS)
-def test_all_outputs_of_a_flight_state_the_same_numbers(shared_logs: Path, name: str) -> None:
+def test_report_terminal_and_json_state_equal_numbers(shared_logs: Path, name: str) -> None:
     outputs = flight_outputs(ComparisonRequest(log=str(shared_logs / name)))
     assert contradictions(outputs) == []
 
 
-def test_statements_differ_only_beyond_their_rounding() -> None:
+def test_numbers_that_differ_only_by_rounding_count_as_equal() -> None:
     exact = Statement("offset", "results", -0.4038)
     assert not printed("offset", "sync", "−0.404").contradicts(exact)
     assert printed("offset", "sync", "−0.405").contradicts(exact)

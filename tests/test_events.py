@@ -37,7 +37,7 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     assert found.resets_s == (30.0,)
 
 
-def test_flight_without_source_is_plotted_but_not_in_statistics() -> None:
+def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
     resets = (Reset(100.0, "position", (1.0, 0.0, 0.0)),)
     flight = aisle_flight(uwb=Uwb(gap_s=(80.0, 130.0)), ekf2=Estimator(resets=resets))
     whole, covered = compare(flight), compare(flight, end_s=80.0)

@@ -46,7 +46,7 @@ def text(page: Browser, name: str) -> str:
 # ------------------------------------------------------------------ one screen
 
 
-def test_explore_page_on_desktop_shows_settings_card_and_plot(page: Browser) -> None:
+def test_explore_page_on_desktop_shows_settings_and_plot(page: Browser) -> None:
     wanted = [*SLIDERS, "#innovation", "#card h2", "#card figure", "#views", ".legend", "#flown"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
@@ -75,7 +75,7 @@ def test_explore_page_plot_labels_do_not_overlap(
     assert overlapping == []
 
 
-def test_explore_page_on_phone_fits_card_and_plot_on_one_screen(
+def test_explore_page_on_phone_fits_diagnosis_and_plot(
     browser: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     show(browser, explored[0], width=390)
@@ -118,7 +118,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 }))"""
 
 
-def test_explore_page_shows_card_of_report_until_settings_change(
+def test_explore_page_shows_report_diagnosis_before_any_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     card = card_of(explored[1])
@@ -137,7 +137,7 @@ def test_explore_page_shows_card_of_report_until_settings_change(
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
 
 
-def test_explore_page_sigma_ratios_after_change_equal_python(
+def test_explore_page_javascript_sigma_ratios_equal_python(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
@@ -205,7 +205,7 @@ def test_explore_page_ekf2_curves_equal_logged_values(
     assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 
 
-def test_explore_page_address_restores_all_settings(
+def test_explore_page_url_restores_all_settings(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     wanted = (

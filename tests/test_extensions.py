@@ -138,7 +138,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.process
 @pytest.mark.parametrize("kind", CHECKS)
-def test_extension_by_documented_files_works(kind: str, extended: Path) -> None:
+def test_extension_guide_steps_give_a_working_extension(kind: str, extended: Path) -> None:
     paths = os.pathsep.join(map(str, (extended, ROOT / "tests")))
     run = subprocess.run(
         [sys.executable, "-c", CHECKS[kind]],
@@ -149,7 +149,7 @@ def test_extension_by_documented_files_works(kind: str, extended: Path) -> None:
     assert kind != "command" or run.stdout == "calm\n"
 
 
-def test_extension_lists_name_existing_files_and_objects() -> None:
+def test_extension_guide_names_only_existing_files() -> None:
     paths = set(re.findall(r"`((?:\w+/)*\w+\.(?:py|toml|md|js|csv))`", EXTENSIONS))
     texts = {}
     for path in paths:
@@ -171,7 +171,7 @@ def test_extension_lists_name_existing_files_and_objects() -> None:
             assert name.split()[-1] in EXTENSIONS
 
 
-def test_setting_of_kf_is_in_request_ranges_and_results() -> None:
+def test_each_kf_setting_has_option_range_and_result_field() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)

@@ -135,7 +135,7 @@ def test_extracted_tables_contain_orientation_from_odometry(sample_flight):
 # ---- the dictionary ---------------------------------------------------------------------------
 
 
-def test_data_dictionary_lists_exactly_the_written_columns(written, sample_flight):
+def test_extract_data_dictionary_lists_exactly_written_columns(written, sample_flight):
     dictionary = pd.read_csv(written / "data_dictionary.csv", keep_default_na=False)
     described = list(zip(dictionary["table"], dictionary["column"], strict=True))
     assert len(set(described)) == len(described)
@@ -155,7 +155,7 @@ def test_data_dictionary_lists_exactly_the_written_columns(written, sample_fligh
 
 
 @pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
-def test_data_dictionary_units_match_column_names(flight):
+def test_extract_data_dictionary_units_match_column_names(flight):
     dictionary = extraction.data_dictionary(flight)
     tables = extraction.tables(flight)
     assert list(dict.fromkeys(dictionary["table"])) == list(tables)
@@ -187,7 +187,7 @@ def test_extracted_flight_json_lists_streams_and_missing_data(written, sample_fl
     ("estimator_states", {"ekf2_variance"}),
     ("vehicle_visual_odometry", {"position_vehicle_visual_odometry"}),
 ])  # fmt: skip
-def test_extract_without_topic_writes_no_table_and_states_it(tmp_path, dropped, lost):
+def test_extract_without_logged_topic_writes_no_table(tmp_path, dropped, lost):
     whole = set(extraction.tables(read_log(make_log().write(tmp_path / "whole.ulg"))))
     path = make_log().drop(dropped).write(tmp_path / "less.ulg")
     said = extract(path, "-o", tmp_path / "out")

@@ -101,7 +101,7 @@ def make_finding(name: str, level: Any = "error", caused_by: str | None = None) 
         (((0.0, 0.05),), "0.0 s"), (((0.0, 0.06),), "0.0 s to 0.1 s"),
     ],
 )  # fmt: skip
-def test_finding_text_lists_times_of_its_occurrence(spans: Any, expected: str) -> None:
+def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> None:
     assert replace(make_finding("x"), spans_s=spans).when == expected
 
 
@@ -114,7 +114,7 @@ def test_status_flag_before_first_sample_has_first_value() -> None:
     assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_group_findings_lists_consequences_below_root_cause() -> None:
+def test_fault_report_lists_consequences_below_root_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert group_by_root([first, follows, other]) == [[first, follows], [other]]
@@ -244,9 +244,7 @@ UNKNOWN = "The log does not contain the reason"
         ),
     ],
 )
-def test_ekf2_not_fusing_finding_states_reason_and_action(
-    flight: Any, reason: str, remedy: str
-) -> None:
+def test_report_on_missing_ekf2_fusion_states_reason(flight: Any, reason: str, remedy: str) -> None:
     finding = only(ekf2_not_fusing.detect, flight)
     assert finding.severity == "error"
     assert finding.title.startswith("EKF2 never fused the UWB positions")
@@ -308,7 +306,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
+def test_report_on_error_beyond_sigma_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -351,7 +349,7 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_finding_tests_rmse_after_alignment(
+def test_error_beyond_sigma_is_tested_after_alignment(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -481,9 +479,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
-    until_s: float, expected: str
-) -> None:
+def test_frd_positions_with_fused_yaw_give_only_a_note(until_s: float, expected: str) -> None:
     frd = source(frame="FRD")
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
@@ -504,7 +500,7 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
     return together(tuple(parts), p, "positions")
 
 
-def test_misaligned_frame_finding_gives_rotation_to_apply() -> None:
+def test_misaligned_frame_report_states_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
@@ -515,7 +511,7 @@ def test_misaligned_frame_finding_gives_rotation_to_apply() -> None:
     assert only(source_frame.detect, one).id == "ekf2_heading_error"
 
 
-def test_heading_drift_finding_states_heading_at_both_ends() -> None:
+def test_heading_drift_report_states_heading_at_start_and_end() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
     for has_ulog, orientation in ((True, object()), (False, object()), (True, None)):
         sent = source(orientation=orientation)
@@ -821,7 +817,7 @@ SOURCE_EDGES = [
 ]  # fmt: skip
 
 
-def test_accelerometer_bias_finding_states_95_percent_interval() -> None:
+def test_accelerometer_bias_report_states_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
@@ -851,7 +847,7 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
 
 
-def test_sample_interval_is_found_despite_jitter() -> None:
+def test_position_sample_interval_is_found_despite_jitter() -> None:
     def base(intervals: Any) -> float | None:
         found = source_intervals._find_period(np.array(intervals))
         return None if found is None else found[0]
@@ -872,14 +868,14 @@ def test_lost_samples_in_a_position_gap_are_not_counted() -> None:
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
-def test_position_jump_finding_states_count_and_largest_jump() -> None:
+def test_position_jump_report_states_count_and_largest_jump() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.detect_jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_finding_states_if_distances_are_too_long() -> None:
+def test_scale_error_report_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -891,7 +887,7 @@ def test_scale_error_finding_states_if_distances_are_too_long() -> None:
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_reported_variance_that_covers_true_error_is_accepted(error_m, expected):
+def test_position_variance_that_covers_true_error_is_accepted(error_m, expected):
     time = np.arange(0.0, 120.0)
     still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     axes = tuple(axis(name, truth=still) for name in ("north", "east"))
@@ -936,7 +932,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         assert f"distance to {reference} is {north_m:.2f} m" in finding.message
 
 
-def test_position_outlier_finding_states_number_ekf2_rejected() -> None:
+def test_position_outlier_report_states_number_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
@@ -1059,7 +1055,7 @@ def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, re
     assert finding.remedy == remedy
 
 
-def test_time_offset_of_gnss_names_the_receiver_delay_parameter() -> None:
+def test_gnss_time_offset_report_names_receiver_delay_parameter() -> None:
     parameters = {"EKF2_GPS_DELAY": 110.0}
     one = analysis(clock=late(-0.05), source=source(origin=GNSS), log=log(parameters=parameters))
     finding = only(source_clock.detect, one)
@@ -1068,7 +1064,7 @@ def test_time_offset_of_gnss_names_the_receiver_delay_parameter() -> None:
 
 
 @pytest.mark.parametrize(("detect", "one", "expected"), EDGES + SOURCE_EDGES)
-def test_finding_severity_changes_at_limits_of_each_detector(
+def test_fault_severity_changes_at_each_detection_limit(
     detect: Any, one: Any, expected: str | None
 ) -> None:
     assert severity(detect, one) == expected

@@ -356,12 +356,12 @@ def ids(findings: tuple[Finding, ...]) -> set[str]:
 
 
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_clean_flight_has_no_findings(seed: int) -> None:
+def test_clean_flight_has_no_reported_faults(seed: int) -> None:
     assert found(compare(aisle_flight(seed=seed))) == ()
 
 
 @pytest.mark.reallogs
-def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None:
+def test_report_on_crash_flight_lists_tumbling_first(shared_logs: Path) -> None:
     """Flight Review log "ekf_failure": accelerometer clipping, then roll and pitch at 68 s."""
     flight = read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg")
     first, second = found(compare(flight))[:2]
@@ -378,7 +378,7 @@ def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None
     ("simulated/v1.16.1_aisle_nominal", "case17.csv", "source_stops", 50.9, 0.12),
     ("simulated/v1.16.1_aisle_10hz", "case18.csv", "source_begins", 63.3, 0.05),
 ])  # fmt: skip
-def test_source_that_covers_part_of_flight_is_first_finding(
+def test_positions_missing_for_part_of_flight_are_reported_first(
     log: str, file: str | None, finding: str, at_s: float, error_m: float, shared_logs: Path
 ) -> None:
     cases = shared_logs.parent / "cases"
@@ -395,7 +395,7 @@ def test_source_that_covers_part_of_flight_is_first_finding(
 @pytest.mark.parametrize(("gap_s", "reset_s", "cause"), [
     ((-1.0, 40.0), 40.4, "source_begins"), ((80.0, 130.0), 90.0, "source_stops"),
 ])  # fmt: skip
-def test_ekf2_reset_without_source_has_missing_source_as_cause(
+def test_ekf2_reset_is_attributed_to_missing_position_source(
     gap_s: tuple[float, float], reset_s: float, cause: str
 ) -> None:
     resets = (Reset(reset_s, "position", (16.0, 0.0, 0.0)),)
@@ -414,7 +414,7 @@ def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: 
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_each_finding_is_tested_with_a_simulated_fault() -> None:
+def test_each_reportable_fault_has_a_simulated_test_flight() -> None:
     assert set(TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 
@@ -423,7 +423,7 @@ def test_each_finding_is_tested_with_a_simulated_fault() -> None:
     list(enumerate(FAULTS)),
     ids=[f"{fault.id}-{fault.severity}" for fault in FAULTS],
 )
-def test_simulated_fault_has_only_its_finding_of_severity_error(at: int, fault: Fault) -> None:
+def test_simulated_fault_is_the_only_reported_error(at: int, fault: Fault) -> None:
     """Messages and actions are compared with tests/golden/findings.txt (see test_golden)."""
     comparison = compare(fault.fly(), Settings(**fault.settings))
     findings = found(comparison, tuned=fault.id in TUNED_IDS)
@@ -440,7 +440,7 @@ def test_simulated_fault_has_only_its_finding_of_severity_error(at: int, fault: 
 @pytest.mark.parametrize(
     ("gate", "expected"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
 )
-def test_narrow_gate_finding_precedes_its_rejection_findings(gate, expected) -> None:
+def test_narrow_gate_is_reported_before_its_rejections(gate, expected) -> None:
     """Expected shares: tables of the normal distribution, two axes."""
     flown = with_ekf2(gate=gate)(aisle_flight(**ekf2(rejected_fraction=0.3)))
     first, *others = found(compare(flown))
@@ -459,7 +459,7 @@ def test_narrow_gate_finding_precedes_its_rejection_findings(gate, expected) -> 
 @pytest.mark.parametrize(
     ("absent", "flight", "present"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
-def test_log_without_required_field_gives_no_finding_about_it(
+def test_fault_that_requires_an_unlogged_field_is_not_reported(
     absent: str, flight: Any, present: str | None
 ) -> None:
     found_ids = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
@@ -469,7 +469,9 @@ def test_log_without_required_field_gives_no_finding_about_it(
 
 @pytest.mark.parametrize("duration_s", [0.4, 2.0])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
-def test_findings_of_very_short_flight_raise_no_exception(fault: Fault, duration_s: float) -> None:
+def test_fault_detection_on_very_short_flight_does_not_raise(
+    fault: Fault, duration_s: float
+) -> None:
     # one in ten of these is lost
     rate_hz = 10.0 if fault.id == "source_samples_lost" else 5.0
     uwb = replace(fault.flight.get("uwb", Uwb()), rate_hz=rate_hz, gap_s=None)
@@ -481,7 +483,7 @@ def test_findings_of_very_short_flight_raise_no_exception(fault: Fault, duration
     assert ("too_few_innovations" in ids(found(comparison))) == few
 
 
-def test_finding_catalogue_entry_has_known_group() -> None:
+def test_each_reportable_fault_belongs_to_a_known_group() -> None:
     for entry in CATALOGUE.values():
         assert entry.group in GROUPS
         assert not entry.title.endswith(".")
@@ -504,7 +506,7 @@ def test_explain_command_examples_state_measured_detection_rates() -> None:
     "typed",
     ["source_scale_error", "Source-Scale-Error"],
 )
-def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatch, capsys) -> None:
+def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, err) == (0, "")
@@ -522,12 +524,12 @@ def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatc
         assert text in out
 
 
-def test_explain_unmeasured_finding_prints_not_measured(monkeypatch, capsys) -> None:
+def test_explain_command_states_if_detection_is_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "detection are not measured" in out
 
 
-def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys) -> None:
+def test_explain_command_without_argument_lists_all_faults(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, _ = run_main(monkeypatch, capsys, "explain")
     assert code == 0
@@ -541,7 +543,7 @@ def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys
 @pytest.mark.parametrize(
     ("typed", "suggestion"), [("source_gapp", "Did you mean source_gap? "), ("xyz", "")]
 )
-def test_explain_command_with_unknown_finding_exits_with_2(
+def test_explain_command_with_unknown_fault_exits_with_2(
     typed, suggestion, monkeypatch, capsys
 ) -> None:
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)

@@ -96,7 +96,7 @@ FLIGHTS = {
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
+def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     found = find(analysis)
@@ -153,7 +153,7 @@ def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
 
 
 @pytest.mark.parametrize("name", [name for name, flown in FLIGHTS.items() if flown.reruns])
-def test_diagnosis_card_of_faulty_flight_shows_filter_reruns(shared_logs, name):
+def test_diagnosis_of_faulty_flight_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     cause = build_card(analysis, ComparisonRequest(log=log.name)).causes[0]
@@ -204,7 +204,7 @@ def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, fac
         ("eg1_d0", {"ekf2_gps_delay_wrong": "warning"}),
     ],
 )
-def test_findings_of_flights_in_pairs_are_as_expected(
+def test_fault_reports_on_recorded_flights_equal_expected_ones(
     shared_logs: Path, name: str, expected: dict[str, str]
 ) -> None:
     analysis = explain(compare(read_log(shared_logs / f"flown/{name}.ulg")))

@@ -140,7 +140,7 @@ def test_partly_correct_answer_form_has_partial_points(
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_answer_form_for_clean_flight_must_name_no_fault() -> None:
+def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).fraction == 0.4
@@ -152,7 +152,7 @@ def test_answer_form_for_clean_flight_must_name_no_fault() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_open_loop_end_answer_earns_all_points_only_with_size() -> None:
+def test_answer_on_open_loop_without_size_earns_partial_points() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -182,7 +182,7 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
             assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.35
 
 
-def test_correct_size_of_open_loop_end_includes_odometry_drift() -> None:
+def test_expected_loop_closure_error_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(

@@ -99,7 +99,7 @@ def clock(name: str) -> ClockMap:
         (gnss(states={"yaw_align": on(0.0)}), "alignment", ("heading",)),
     ],
 )  # fmt: skip
-def test_first_unmet_fusion_condition_states_value_and_action(
+def test_unmet_ekf2_fusion_condition_is_reported_with_value(
     tried: Attempt, name: str | None, texts: tuple[str, ...]
 ) -> None:
     found = find_unmet(tried)
@@ -115,13 +115,13 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_constant_positions_that_ekf2_does_not_fuse_are_no_finding() -> None:
+def test_constant_positions_not_fused_by_ekf2_are_not_reported() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
     assert named(ekf2_not_fusing.detect, still) == {}
 
 
-def test_position_file_not_sent_to_ekf2_has_no_fusion_finding() -> None:
+def test_position_file_unknown_to_ekf2_is_not_reported_unfused() -> None:
     beside = unfused(source={"origin": POSITION_FILE}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source
@@ -161,7 +161,7 @@ def test_position_that_ekf2_declares_invalid_is_reported(
         ("logs/flown/eg1_base.ulg", None, ()),
     ],
 )
-def test_unmet_fusion_condition_of_logged_flight_is_found(
+def test_unmet_ekf2_fusion_condition_is_found_in_real_log(
     path: str, source_name: str | None, texts: tuple[str, ...], shared_logs: Path
 ) -> None:
     flight = read_log(shared_logs.parent / path)

@@ -84,7 +84,7 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch) -> None:
+def test_grade_report_that_exceeds_time_limit_is_not_verified(tmp_path, monkeypatch) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
@@ -228,7 +228,7 @@ def test_grade_output_file_names_are_safe_and_unique() -> None:
     ]  # fmt: skip
 
 
-def test_grade_command_passes_all_course_options(tmp_path, monkeypatch) -> None:
+def test_grade_command_applies_all_course_options(tmp_path, monkeypatch) -> None:
     import px4fuse.classroom.grading.grade as module
 
     noted = Mock(return_value=GradeOutcome((), (), 0, ()))

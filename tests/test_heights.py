@@ -155,7 +155,7 @@ def test_height_innovation_refers_to_sample_time() -> None:
     np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])
 
 
-def test_weighted_height_sample_equals_repeated_samples() -> None:
+def test_height_sample_with_weight_2_equals_two_samples() -> None:
     """R = 0.25 m² with weight 2 acts as two samples; S is that of one."""
     P = np.zeros((1, 9, 9))
     P[0, 8, 8] = 0.5
@@ -302,7 +302,7 @@ def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
-def test_clipped_acceleration_has_noise_of_4_9_m_s2() -> None:
+def test_ekf2_noise_of_clipped_acceleration_is_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (segment,) = inputs.segments
@@ -334,7 +334,7 @@ def test_bad_acceleration_fraction_equals_clipped_imu_fraction() -> None:
     assert np.flatnonzero(update_log.clipped_fraction).tolist() == [100, 200]
 
 
-def test_ekf2_flag_for_bad_acceleration_follows_innovations() -> None:
+def test_bad_acceleration_flag_is_set_by_two_large_innovations() -> None:
     """Two innovations of different sensors, above 3 √S and above √S; the flag lasts 3 s."""
     nan = np.nan
     segment = climbing(of_baro([10], [0.0]))

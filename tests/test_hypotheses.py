@@ -171,7 +171,7 @@ def test_clean_flight_has_no_bias_scale_error_or_jump() -> None:
         ("r-scale=4", "source_reported_variance_wrong", "note", {"variance_factor": (4.0, 0.8)}),
     ],
 )
-def test_simulated_fault_is_first_finding_with_its_size(mistake, name, severity, evidence) -> None:
+def test_simulated_fault_is_reported_first_with_its_size(mistake, name, severity, evidence) -> None:
     named = found(flown(mistake))
     assert next(iter(named)) == name
     assert ("source_low_pass_filtered" in named) == (name == "source_low_pass_filtered")
@@ -191,7 +191,7 @@ def test_simulated_fault_is_first_finding_with_its_size(mistake, name, severity,
         ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
-def test_finding_of_simulated_fault_contains_a_command(
+def test_report_on_simulated_fault_contains_a_command(
     name, mistake, settings, severity, remedy
 ) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
@@ -226,7 +226,7 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert heading == pytest.approx(30.0, abs=15.0)
 
 
-def test_time_offset_is_not_reported_as_low_pass() -> None:
+def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0
     _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"))
@@ -271,12 +271,12 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_flight_without_required_data_gives_no_bias_finding(mistake, change) -> None:
+def test_accelerometer_bias_without_its_data_is_not_reported(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 
 
-def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
+def test_bias_estimate_without_noise_estimate_is_unavailable() -> None:
     tuned = flown("jump=1,40s")
     fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock)
     assert isinstance(fit, Unavailable)
@@ -289,7 +289,7 @@ def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
 
 
 @pytest.mark.parametrize("mistake", ["accel-bias=0.4", "jump=1,21s", "decimate=2Hz"])
-def test_very_short_flight_gives_no_bias_or_jump_finding(mistake) -> None:
+def test_bias_or_jump_on_very_short_flight_is_not_reported(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
     assert isinstance(short.systematic_errors, Unavailable)

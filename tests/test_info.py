@@ -63,7 +63,7 @@ def remedies(inventory: Inventory) -> list[str]:
 # ---- the sample log ---------------------------------------------------------------------------
 
 
-def test_info_rows_match_contents_of_flight(sample_flight):
+def test_info_output_matches_contents_of_log(sample_flight):
     inventory, ekf2 = take_inventory(sample_flight), sample_flight.ekf2
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,

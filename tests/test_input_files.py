@@ -91,7 +91,7 @@ def test_grade_refuses_output_folder_linked_to_its_inputs(class_desk) -> None:
     assert file_hashes(class_desk) == before
 
 
-def test_second_grade_run_does_not_replace_file_of_pseudonyms(class_desk) -> None:
+def test_second_grade_run_keeps_the_file_of_pseudonyms(class_desk) -> None:
     command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
     run_checked(*command)
     (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")
@@ -149,7 +149,7 @@ def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
     assert path.read_bytes() == b"x"
 
 
-def test_protected_inputs_without_inodes_are_compared_by_path(tmp_path, monkeypatch) -> None:
+def test_input_file_without_inode_is_protected_by_its_path(tmp_path, monkeypatch) -> None:
     """Simulate a file system that ignores case and gives every file the inode 0."""
     from px4fuse.core.input_files import (
         add_input,

@@ -61,7 +61,7 @@ def test_import_px4fuse_loads_no_numeric_library() -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_findings_of_python_equal_those_of_command_line(sample_log, analysis, tmp_path):
+def test_python_fault_list_equals_that_of_command_line(sample_log, analysis, tmp_path):
     command = "compare", sample_log, "--sigma-z", "0.2", "--json", "-", "-o", tmp_path / "r.pdf"
     told = json.loads(run_checked(*command).stdout)["findings"]
     typed = [(f["id"], f["message"], f["remedy"]) for f in told]

@@ -35,7 +35,7 @@ FORM = Answers(
 )
 
 
-def test_item_discrimination_is_correlation_with_other_points() -> None:
+def test_item_discrimination_equals_correlation_with_other_items() -> None:
     for index, item in enumerate(analyse_items(REPORTS)):
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]
@@ -47,7 +47,7 @@ def test_item_analysis_of_four_reports_has_no_discrimination() -> None:
     assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
 
 
-def test_item_analysis_lists_form_parts_and_faults() -> None:
+def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     reports = [
         replace(each, form_parts=(Item("sizes", n, 15.0, ""),), mistakes={"nlos": n > 1})
         for n, each in enumerate(REPORTS)
@@ -58,12 +58,12 @@ def test_item_analysis_lists_form_parts_and_faults() -> None:
     assert fault.csv_row[1:3] == ("5", "0.6")
 
 
-def test_item_analysis_excludes_reports_with_open_decision() -> None:
+def test_item_analysis_excludes_reports_pending_review() -> None:
     reports = [replace(each, instructor_action="Decide.") for each in REPORTS]
     assert analyse_items(reports) == []
 
 
-def test_oral_questions_ask_about_false_and_missed_faults_first() -> None:
+def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     questions = [*ask_about_form(FORM, TRUTH)]
     assert "You named dropout" in questions[0][0]
     assert "nlos, yaw" in questions[0][1]
@@ -75,7 +75,7 @@ def test_oral_questions_ask_about_false_and_missed_faults_first() -> None:
     assert "overconfident (σ is wrong by a factor of 2)" in questions[4][1]
 
 
-def test_oral_questions_page_lists_n_questions_of_each_student() -> None:
+def test_oral_exam_page_lists_n_questions_per_student() -> None:
     key = AnswerKey("aisle", (RightAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
     report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
     rows = (replace(entry("s1", "Ada", 5.0), counted_report=report), entry("s2", "Max", None))

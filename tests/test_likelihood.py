@@ -76,7 +76,7 @@ def test_fast_kf_does_not_fuse_skipped_measurement() -> None:
     assert np.all(nu[skip] != 0.0)
 
 
-def test_likelihood_grid_of_noises_equals_normal_density() -> None:
+def test_kf_likelihood_equals_normal_density_of_innovations() -> None:
     """Compare both axes with scipy's density of the replay's innovations."""
     axes = walk(4, count=60), walk(5, count=60)
     a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])

@@ -118,7 +118,7 @@ def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
     assert robust.reason == SINGLE_LOOP_REASON
 
 
-def test_loop_on_lesson_example_2_equals_lesson_output() -> None:
+def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m
@@ -154,7 +154,7 @@ def test_loop_correction_with_heading_does_not_increase_rpe(sample_loop: Loop) -
     assert plain > 1.1 * before
 
 
-def test_loop_corrections_without_heading_error_are_equal(sample, sample_loop) -> None:
+def test_loop_correction_methods_agree_without_heading_error(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [
         POSITIONS_CORRECTED_LABEL,
         HEADINGS_CORRECTED_LABEL,
@@ -168,7 +168,7 @@ def test_loop_corrections_without_heading_error_are_equal(sample, sample_loop) -
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_loop_closure_error_to_given_landing_equals_true_error(
+def test_loop_closure_error_with_known_landing_equals_truth(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x
@@ -185,7 +185,7 @@ def test_loop_closure_error_from_tlog_equals_ground_truth(shared_logs: Path) -> 
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
-def test_loop_on_absolute_positions_instead_of_odometry_warns() -> None:
+def test_loop_command_on_absolute_positions_gives_warning() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
@@ -279,7 +279,7 @@ def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
     assert find_loop(opened) == ()
 
 
-def test_loop_closure_corrects_heading_only_if_headings_agree() -> None:
+def test_loop_closure_without_equal_heading_uses_position_only() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -303,7 +303,7 @@ def test_contradicting_loop_closure_is_reported_as_inconsistent() -> None:
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
 
-def test_loop_drift_setting_that_is_too_small_is_reported() -> None:
+def test_loop_drift_option_below_true_drift_is_reported() -> None:
     """The odometry has a heading error in every step; the stated drift is small."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
@@ -314,7 +314,9 @@ def test_loop_drift_setting_that_is_too_small_is_reported() -> None:
     assert "loop_drift_too_small" in {finding.id for finding in find_loop(found)}
 
 
-def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
+def test_loop_without_known_landing_point_gives_a_note(
+    sample: LoopSource, sample_loop: Loop
+) -> None:
     assert find_loop(sample_loop) == ()  # the log contains ground truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
@@ -324,7 +326,7 @@ def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_
     assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_of_odometry_that_stops_in_flight_has_no_closure(sample: LoopSource) -> None:
+def test_odometry_that_stops_in_flight_gets_no_loop_closure(sample: LoopSource) -> None:
     """Without ground truth; the place at which the odometry stops is not the landing place."""
     flight = replace(sample.flight, truth=Unavailable("ground truth", "not logged", "Log it."))
     (start_s, landing_s), trajectory = flight.airborne[0], sample.trajectory

@@ -69,7 +69,7 @@ def test_magnetometer_bias_is_estimated_on_turning_vehicle() -> None:
     np.testing.assert_allclose(x[0, 15:18], EARTH, atol=1e-3)
 
 
-def test_weighted_magnetometer_sample_equals_repeated_samples() -> None:
+def test_magnetometer_sample_with_weight_5_equals_five_samples() -> None:
     seen = field_samples(Rotation.from_euler("z", 0.4), np.zeros(3))
     noise, gate = np.array([0.05]), np.array([3.0])
     x, P = known_field_state()

@@ -236,7 +236,7 @@ def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
 
 
 @pytest.mark.parametrize("start_known", [True, False])
-def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> None:
+def test_segment_with_one_position_does_not_change_likelihood(start_known: bool) -> None:
     part = with_constants()
     if not start_known:
         part = replace(part, prior_precision=np.zeros((COUNT, 2)))
@@ -276,7 +276,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_subtracting_imu_path_from_positions_keeps_likelihood() -> None:
+def test_likelihood_is_unchanged_if_imu_path_is_subtracted() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
     plain, found_values = (fit_positions(*each).scores()[0] for each in given)
@@ -296,7 +296,7 @@ def test_subtracting_imu_path_from_positions_keeps_likelihood() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_interpolated_likelihood_of_noises_equals_computed_one(which: str) -> None:
+def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":

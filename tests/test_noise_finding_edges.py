@@ -106,7 +106,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
     ],
 )  # fmt: skip
-def test_wrong_noise_finding_recommends_the_improving_rerun(trials: Any, expected: Any) -> None:
+def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
@@ -136,7 +136,7 @@ def test_rerun_of_consistent_kf_does_not_refute_noise_estimate(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_wrong_noise_finding_states_factor_and_estimated_noise() -> None:
+def test_wrong_noise_report_states_factor_and_estimated_noise() -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -176,7 +176,7 @@ def test_recommended_sigma_z_is_at_least_5_mm() -> None:
          ["sigma_a_too_large", "sigma_z_too_small"]),
     ],
 )  # fmt: skip
-def test_too_large_noise_for_odometry_has_no_finding(
+def test_too_large_noise_for_odometry_is_not_reported(
     parts: dict[str, Any], expected: list[str]
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
@@ -208,13 +208,13 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_process_noise_finding_requires_correlation(
+def test_near_zero_process_noise_report_requires_correlation(
     one: Any, expected: str | None
 ) -> None:
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_finding_states_response_time() -> None:
+def test_near_zero_process_noise_report_states_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -237,7 +237,7 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
-def test_inconsistent_filter_severity_changes_at_nis_of_4() -> None:
+def test_inconsistent_filter_is_an_error_from_mean_nis_of_4() -> None:
     for nis, expected in (
         (3.99, "warning"), (4.0, "error"), (0.25, "error"), (0.251, "warning"),
     ):  # fmt: skip
@@ -252,7 +252,7 @@ def test_inconsistent_filter_severity_changes_at_nis_of_4() -> None:
     )
 
 
-def test_inconsistent_filter_finding_combines_north_and_east() -> None:
+def test_inconsistent_filter_report_combines_north_and_east() -> None:
     axes = (kf(0.1, "aisle"), kf(2.0), kf(3.0, "east"), kf(9.0, "down"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
@@ -420,7 +420,7 @@ def test_noise_of_overconfident_ekf2_is_advised_without_replay(
           "rejects 44 % of the positions")),
     ],
 )  # fmt: skip
-def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
+def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -490,7 +490,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_possible_source_drift_finding_states_closure_error() -> None:
+def test_possible_drift_report_states_loop_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("not the position error.")
@@ -522,7 +522,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
         (NONE, None),
     ],
 )  # fmt: skip
-def test_drift_finding_states_closure_error_of_known_landing(loop: Any, size: str | None) -> None:
+def test_drift_report_states_closure_error_at_known_landing(loop: Any, size: str | None) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")

@@ -61,12 +61,12 @@ def outcome(request: ComparisonRequest) -> str:
     return repr((*inputs, source.description, compared.segment, compared.settings, numbers))
 
 
-def test_this_file_has_a_value_for_each_field_of_a_request() -> None:
+def test_each_option_of_compare_is_tested_with_another_value() -> None:
     assert set(CHANGED) == set(ComparisonRequest.__struct_fields__)
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_each_field_of_analysis_request_changes_the_results(name: str) -> None:
+def test_each_option_of_compare_changes_the_results(name: str) -> None:
     request = ComparisonRequest(log=ULOG)
     if name == "system":
         request = ComparisonRequest(log=TLOG)

@@ -70,7 +70,7 @@ def test_latitude_longitude_to_metres_and_back_is_exact(
     assert north[0] == pytest.approx(111_194.93, abs=0.01)
 
 
-def test_simulated_gnss_fixes_have_stated_noise_and_age(
+def test_simulated_gnss_fixes_have_configured_noise_and_delay(
     tmp_path: Path,
 ) -> None:
     simulation = simulate(make_scenario("outdoor", seed=2, passes=6))
@@ -94,7 +94,7 @@ def test_simulated_gnss_fixes_have_stated_noise_and_age(
     assert stated.to_numpy() == pytest.approx([0.16, 0.16, 0.36], rel=1e-5)
 
 
-def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> None:
+def test_simulated_magnetometer_and_height_noise_equal_settings(tmp_path: Path) -> None:
     """Includes EKF2's height, and its attitude published as vehicle_attitude."""
     log = tmp_path / "outdoor.ulg"
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse_mistakes(["mag=0.3,60"]))))
@@ -121,7 +121,7 @@ def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> 
     assert error[20:].std() == pytest.approx(reported, rel=0.3)
 
 
-def test_outdoor_flight_without_fault_is_consistent() -> None:
+def test_simulated_outdoor_flight_without_fault_is_consistent() -> None:
     analysis = flown()
     assert roots(analysis) == []
     for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
@@ -160,7 +160,7 @@ def test_outdoor_flight_without_fault_is_consistent() -> None:
         ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
-def test_simulated_outdoor_fault_is_first_finding(mistake: str, root: str) -> None:
+def test_simulated_outdoor_fault_is_reported_first(mistake: str, root: str) -> None:
     """Faults for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
@@ -182,7 +182,7 @@ def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
     assert is_sufficient(found, of)
 
 
-def test_nees_with_vibration_is_partly_corrected_by_acc_noise() -> None:
+def test_larger_ekf2_acc_noise_partly_corrects_vibration_nees() -> None:
     """EKF2_ACC_NOISE corrects the filter, but the output predictor still integrates vibration."""
     analysis = flown("vibration=1")
     (tried,) = find_trials(analysis.trials, "ekf2", "aisle", "nees")
@@ -255,7 +255,7 @@ def test_simulate_with_ineffective_ekf2_noise_raises_error() -> None:
     assert parameters["EKF2_GPS_P_NOISE"] == 0.8
 
 
-def test_simulated_correlated_error_has_given_sigma_and_time() -> None:
+def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
     mistakes = Mistakes(slow_error_m=0.5, slow_error_s=4.0)
     drawn = sensors.slow_error(OUTDOOR, mistakes, 100_000, 0.2)
     assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)

@@ -27,11 +27,11 @@ def test_fusion_switched_off_in_flight_explains_missing_fusion() -> None:
     assert (effect.caused_by, effect.remedy) == ("parameter_changed", first.remedy)
 
 
-def test_parameter_change_without_effect_is_a_note() -> None:
+def test_parameter_change_in_flight_without_effect_gives_a_note() -> None:
     assert found(with_change(aisle_flight(), "EKF2_EVP_NOISE", 0.1, 0.11)).severity == "note"
 
 
-def test_parameter_change_that_increases_the_error_is_a_warning() -> None:
+def test_parameter_change_in_flight_with_larger_error_is_warning() -> None:
     flight = aisle_flight()
     state = flight.ekf2.state.copy()
     state.loc[60.0:, ["north_m", "east_m"]] += 0.5

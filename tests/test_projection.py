@@ -133,7 +133,9 @@ def test_unlogged_measurement_noise_is_read_from_parameters() -> None:
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
 ])  # fmt: skip
-def test_measurement_variance_follows_ekf2_noise_rule(parameters, reported_m, expected_m2) -> None:
+def test_ekf2_position_variance_follows_its_noise_parameters(
+    parameters, reported_m, expected_m2
+) -> None:
     made = flight(parameters=parameters)
     (track,) = made.positions
     if reported_m is not None:

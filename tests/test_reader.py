@@ -582,7 +582,7 @@ SIMULATED = [
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SIMULATED)
-def test_read_log_of_simulation_returns_the_sent_uwb_samples(shared_logs, name):
+def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name):
     """Each sample of the chosen source equals a sent sample, at its measurement time."""
     flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
     sent = json.loads((shared_logs / "simulated" / f"{name}.json").read_text())

@@ -65,7 +65,7 @@ def largest_errors(
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SHARED_FILES)
-def test_read_position_of_shared_recording_equals_original(name: str) -> None:
+def test_read_position_file_of_recorded_cases_equals_original(name: str) -> None:
     folder = shared("cases/position_files")
     expected = json.loads((folder / "EXPECTED.json").read_text())["files"][name]
     options = expected["options"]
@@ -78,7 +78,7 @@ def test_read_position_of_shared_recording_equals_original(name: str) -> None:
 
 
 @pytest.mark.reallogs
-def test_read_position_of_shared_lfs_pointer_names_git_lfs() -> None:
+def test_read_position_file_of_git_lfs_pointer_names_git_lfs() -> None:
     with pytest.raises(Px4FuseError, match=r"Git LFS.*git lfs pull"):
         read_position_file(shared("cases/position_files") / "lfs_pointer.csv")
 
@@ -189,7 +189,7 @@ def check_track(recording: PositionRecording, clock: str) -> None:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_read_position_of_each_format_equals_original(name: str, tmp_path: Path) -> None:
+def test_read_position_file_in_each_format_equals_original(name: str, tmp_path: Path) -> None:
     file_name, content, body, clock = FORMATS[name]
     path = tmp_path / file_name
     path.write_text(content)
@@ -197,7 +197,7 @@ def test_read_position_of_each_format_equals_original(name: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["Motive", "Vicon Nexus segments", "Marvelmind with two beacons"])
-def test_read_position_of_two_bodies_lists_their_names(name: str, tmp_path: Path) -> None:
+def test_read_position_file_with_two_bodies_lists_their_names(name: str, tmp_path: Path) -> None:
     file_name, content, body, _ = FORMATS[name]
     path = tmp_path / file_name
     path.write_text(content)
@@ -206,7 +206,7 @@ def test_read_position_of_two_bodies_lists_their_names(name: str, tmp_path: Path
     check_track(read_position_file(f"{path}:{body}"), FORMATS[name][3])
 
 
-def test_read_kitti_poses_takes_times_of_their_file(tmp_path: Path) -> None:
+def test_read_kitti_poses_takes_timestamps_from_times_file(tmp_path: Path) -> None:
     path = tmp_path / "poses.txt"
     matrices = np.concatenate([ROTATION.as_matrix(), TRACK_M[:, :, None]], axis=2)
     np.savetxt(path, matrices.reshape(ROWS, 12))
@@ -279,7 +279,7 @@ def write_bag(folder: Path, kind: str, plugin: StoragePlugin | None) -> Path:
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-def test_read_position_of_each_ros_message_equals_original(kind: str, tmp_path: Path) -> None:
+def test_read_position_file_of_each_ros_message_equals_original(kind: str, tmp_path: Path) -> None:
     path = write_bag(tmp_path, kind, StoragePlugin.MCAP)
     recording = read_position_file(path)
     if kind == "VehicleOdometry":
@@ -293,7 +293,7 @@ def test_read_position_of_each_ros_message_equals_original(kind: str, tmp_path: 
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP, None])
-def test_read_trajectory_of_each_bag_format_equals_original(plugin, tmp_path: Path) -> None:
+def test_read_trajectory_from_each_rosbag_format_equals_original(plugin, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "PoseStamped", plugin)
     files = [path, next(path.iterdir())] if plugin else [path]
     for file in files:
@@ -321,7 +321,7 @@ def test_read_trajectory_of_each_bag_format_equals_original(plugin, tmp_path: Pa
     (b"ULog\x01\x125\x01", "PX4 ULog"),
 ])  # fmt: skip
 @pytest.mark.parametrize("read", [read_position_file, read_trajectory])
-def test_read_foreign_file_names_its_format(read, content, words, tmp_path: Path) -> None:
+def test_error_on_unsupported_file_names_its_format(read, content, words, tmp_path: Path) -> None:
     path = tmp_path / "file.csv"
     path.write_bytes(content)
     with pytest.raises(Px4FuseError, match=words):
@@ -329,7 +329,7 @@ def test_read_foreign_file_names_its_format(read, content, words, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.db3", "a.bag"])
-def test_read_broken_bag_is_rejected(name: str, tmp_path: Path) -> None:
+def test_read_damaged_rosbag_is_rejected(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_bytes(b"no bag" * 99)
     with pytest.raises(Px4FuseError, match=f"{name}: the ROS bag cannot be read"):

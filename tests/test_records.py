@@ -30,7 +30,7 @@ RECORDS = [kind for kind in classes() if dataclasses.is_dataclass(kind)]
 STRUCTS = [kind for kind in classes() if issubclass(kind, msgspec.Struct)]
 
 
-def test_all_record_types_of_package_are_immutable() -> None:
+def test_all_dataclasses_and_structs_are_immutable() -> None:
     assert len(RECORDS) > 50
     assert len(STRUCTS) > 50
     mutable = {kind.__name__ for kind in RECORDS if not kind.__dataclass_params__.frozen}  # type: ignore[attr-defined]

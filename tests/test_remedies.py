@@ -83,7 +83,7 @@ def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistake
 
 
 @pytest.mark.parametrize(("seed", "mistakes"), [(1, ()), (2, ("ekf2-noise=50cm",))])
-def test_drift_of_vio_is_the_first_finding(seed, mistakes) -> None:
+def test_vio_drift_is_reported_first(seed, mistakes) -> None:
     """With PX4's default noise, and with an EKF2 noise of 50 times the short-term noise."""
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)
@@ -118,7 +118,7 @@ def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises")
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_filter_rerun_improvement_states_improved_quantity(
+def test_filter_rerun_with_smaller_nis_or_rmse_is_improvement(
     nis, nees, rmse_m, expected, has
 ) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
@@ -126,7 +126,7 @@ def test_filter_rerun_improvement_states_improved_quantity(
     assert has_effect(one) is has
 
 
-def test_recommended_rerun_has_the_fewest_sufficient_changes() -> None:
+def test_rerun_with_fewest_changed_settings_is_recommended() -> None:
     right, near = (
         RunStatistics(nis_mean=1.0, nees_mean=1.0),
         RunStatistics(nis_mean=1.2, nees_mean=1.2),
@@ -155,7 +155,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
     return replace(changed, trials=trials)
 
 
-def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> None:
+def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:
@@ -183,7 +183,7 @@ def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> 
     assert ml_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
 
 
-def test_ekf2_noise_action_for_reported_variance_sets_noise_mode(sample: Analysis) -> None:
+def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert noise_used_m(model.inputs) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, noise_used_m(model.inputs)

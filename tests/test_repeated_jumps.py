@@ -31,7 +31,7 @@ def time_s() -> np.ndarray:
     (1.2 * (time_s() / 12.0 % 1.0), 9, "possible causes are relocalisation"),
     (0.18 * (time_s() // 3.0 % 2.0), 39, "measures two points in turn, 0.18 m apart"),
 ])  # fmt: skip
-def test_unannounced_jumps_are_reported_with_their_pattern(shift_m, count, words) -> None:
+def test_position_jumps_without_reset_counter_are_reported(shift_m, count, words) -> None:
     (found,) = source_positions.detect_repeated_jumps(shifted(shift_m))
     assert found.evidence["count"] == pytest.approx(count, abs=2)
     assert words in found.message
@@ -44,5 +44,5 @@ def test_single_outliers_are_not_reported_as_jumps() -> None:
     assert not [*source_positions.detect_repeated_jumps(shifted(outliers))]
 
 
-def test_clean_precise_source_has_no_repeated_jumps() -> None:
+def test_precise_positions_without_jumps_report_no_jumps() -> None:
     assert not [*source_positions.detect_repeated_jumps(shifted(0.0 * time_s()))]

@@ -24,7 +24,7 @@ def analyse(shared_logs: Path, name: str) -> Analysis:
     ("vio_relocalises", "source_relocalises", ("jumps 5 times", "every 12 s", "1.2 s later")),
     ("camera_ahead_of_the_imu", "source_lever_arm", ("+0.12 m forward", "EKF2_EV_POS_X to 0.12")),
 ])  # fmt: skip
-def test_situation_of_public_report_is_first_finding(
+def test_fault_of_public_bug_report_is_reported_first(
     name: str, finding: str, texts: tuple[str, ...], shared_logs: Path
 ) -> None:
     first, *others = analyse(shared_logs, name).findings
@@ -55,7 +55,7 @@ def test_zero_innovations_are_not_reported_as_missing_fusion(shared_logs: Path) 
     assert "aid_not_fused" not in {finding.id for finding in analysis.findings}
 
 
-def test_height_nees_is_not_computed_from_an_altitude(shared_logs: Path) -> None:
+def test_height_nees_uses_local_height_instead_of_altitude(shared_logs: Path) -> None:
     analysis = diagnose(ComparisonRequest(log=str(shared_logs / "flown" / "eg1_base.ulg")))
     truth = analysis.axes["down"].filters["ekf2"].truth
     assert truth.nees_position_horizon_mean == pytest.approx(2.87, rel=0.05)

@@ -207,7 +207,7 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     )
 
 
-def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
+def test_report_omits_time_offset_page_if_not_significant() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, is_determinable=False, reason="no motion")
     with_finding = [
@@ -246,7 +246,7 @@ def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
     ],
     ids=["fits", "other delay", "late", "early", "negligible", "changes", "drift", "no drift"],
 )  # fmt: skip
-def test_time_offset_advice_states_result_and_action(
+def test_report_on_time_offset_states_estimate_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)

@@ -79,16 +79,16 @@ def parsed(command: str) -> Request:
 
 @settings(deadline=None)
 @given(COMPARISONS | LOOPS)
-def test_analysis_request_as_command_line_is_parsed_back_equal(request: Request) -> None:
+def test_compare_options_written_as_command_are_parsed_back(request: Request) -> None:
     assert parsed(command_line(request)) == request
 
 
 @given(COMPARISONS | LOOPS)
-def test_analysis_request_written_as_json_is_read_back_equal(request: Request) -> None:
+def test_compare_options_written_as_json_are_read_back_equal(request: Request) -> None:
     assert msgspec.json.decode(msgspec.json.encode(request), type=Request) == request
 
 
-def test_analysis_request_without_paths_has_only_file_names() -> None:
+def test_compare_options_without_paths_keep_only_file_names() -> None:
     request = ComparisonRequest(log="/home/eve/a.ulg", position=PositionFile(path="../d.csv"))
     assert command_line(request) == "px4fuse compare a.ulg --position d.csv"
     assert "eve" not in msgspec.json.encode(request.without_paths()).decode()
@@ -106,7 +106,7 @@ def test_analysis_request_without_paths_has_only_file_names() -> None:
         ({"command": "compare", "log": "a", "system": 256}, "<= 255"),
     ],
 )
-def test_analysis_request_from_invalid_json_is_rejected(recorded: object, says: str) -> None:
+def test_compare_options_from_invalid_json_are_rejected(recorded: object, says: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=says):
         msgspec.convert(recorded, Request)
 
@@ -118,7 +118,7 @@ def test_analysis_request_from_invalid_json_is_rejected(recorded: object, says: 
         (loop, requests.OPTION_NAMES[LoopRequest], (LoopRequest,)),
     ],
 )
-def test_analysis_request_has_a_field_for_each_option(command, declared, kinds) -> None:
+def test_each_command_option_has_a_field_in_the_python_request(command, declared, kinds) -> None:
     """An option that is not in the request would be missing in the results."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",

@@ -52,7 +52,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Trial:
     return find_cause(analysis.trials, owner, "aisle", of)
 
 
-def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
+def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
     assert not any(trial.discrepancies for trial in flown().trials)
 
 
@@ -79,7 +79,7 @@ def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_cause_found_for_simulated_fault_is_that_fault(
+def test_filter_reruns_find_the_simulated_fault_as_cause(
     mistake, settings, owner, of, change
 ) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
@@ -165,7 +165,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
 rms_difference = attrgetter("main.difference.position_rms_m")
 
 
-def test_cause_states_position_difference_before_and_after() -> None:
+def test_filter_rerun_states_kf_ekf2_difference_before_and_after() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
     row = cause(kf_case, "kf")
@@ -182,7 +182,7 @@ def test_cause_states_position_difference_before_and_after() -> None:
     )
 
 
-def test_filter_rerun_excludes_outliers_at_shifted_timestamps() -> None:
+def test_filter_rerun_with_time_offset_excludes_shifted_outliers() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
@@ -200,7 +200,7 @@ def test_filter_rerun_excludes_outliers_at_shifted_timestamps() -> None:
         assert nis.mean() < 1.3
 
 
-def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
+def test_ekf2_is_rerun_with_default_of_each_changed_parameter() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
@@ -210,7 +210,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_explains_50_to_150_percent_of_inconsistency() -> None:
+def test_fault_cause_must_explain_50_to_150_percent_of_nis() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Trial:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
         return Trial(

@@ -64,7 +64,7 @@ def test_results_schema_rejects_invalid_results(one):
     ],
     ids=lambda options: next(iter(options)),
 )
-def test_results_of_any_settings_follow_the_schema(sample_flight, options):
+def test_results_json_of_any_settings_follows_the_schema(sample_flight, options):
     made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(made[1])
     assert_valid(text)

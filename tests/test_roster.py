@@ -98,7 +98,7 @@ ROSTERS = {
 
 
 @pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
-def test_read_roster_accepts_any_table_format(tmp_path, content) -> None:
+def test_read_class_list_accepts_any_table_format(tmp_path, content) -> None:
     students = read_roster(written(tmp_path, content))
     assert [one.student_id for one in students] == ["1001", "1002"]
     assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
@@ -124,7 +124,7 @@ BAD_ROSTERS = {
 
 
 @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
-def test_read_invalid_roster_raises_one_line_error(tmp_path, content, said) -> None:
+def test_read_invalid_class_list_raises_one_line_error(tmp_path, content, said) -> None:
     with pytest.raises(SettingsError) as error:
         read_roster(written(tmp_path, content, "utf-8"))
     assert said in str(error.value)
@@ -179,7 +179,7 @@ def test_student_is_matched_by_id_before_name() -> None:
     assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
-def test_grading_worksheet_completes_fields_of_class_list() -> None:
+def test_class_list_is_completed_from_grading_worksheet() -> None:
     register = Register(
         [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
         [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
@@ -247,7 +247,7 @@ def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
     assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
 
 
-def test_read_people_reads_extension_of_due_time(tmp_path) -> None:
+def test_read_class_list_reads_due_time_extension(tmp_path) -> None:
     sheet = table(tmp_path, "id,name,Extension\n0042,Jane Doe,2026-11-22 12:00\n7,Max Roe,\n")
     assert [person.extended_due for person in read_people(sheet)] == ["2026-11-22 12:00", ""]
 

@@ -149,13 +149,13 @@ CHECKED = [
 
 
 @pytest.mark.parametrize(("check", "results", "given", "points", "said"), CHECKED)
-def test_rubric_check_gives_points_and_comment(check, results, given, points, said):
+def test_each_rubric_check_gives_expected_points_and_comment(check, results, given, points, said):
     found, comment = check_points(check, results, **given)
     assert found == pytest.approx(points, abs=0.01), comment
     assert said in comment
 
 
-def test_unclear_time_offset_of_assigned_flight_earns_all_points():
+def test_report_with_undeterminable_time_offset_earns_points():
     assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 
@@ -263,7 +263,7 @@ class TestScore:
         # with the owner from the platform
         assert assess_results(given, key=key(), submitter_id="s01").instructor_action == ""
 
-    def test_report_on_log_outside_answer_key_is_pending(self):
+    def test_report_on_log_missing_in_answer_key_is_pending_review(self):
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
         assert "not about a log of the answer key" in made.instructor_action
 

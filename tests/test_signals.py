@@ -197,7 +197,7 @@ def test_positions_are_projected_on_each_axis():
     np.testing.assert_allclose(axes["aisle"].measurement_m, along + offset, atol=1e-9)
 
 
-def test_positions_and_imu_are_projected_on_given_heading():
+def test_positions_and_imu_are_projected_on_requested_heading():
     time = np.arange(0.0, 10.0, 0.01)
     track, _ = line_track(30.0, count=50)
     flight = flight_of(
@@ -222,7 +222,7 @@ def test_clock_shift_changes_only_timestamps():
     assert replace(moved, **kept) == track
 
 
-def test_axis_contains_only_measurements_of_evaluated_segment():
+def test_kf_uses_only_measurements_of_evaluated_segment():
     track, _ = line_track(30.0)
     track.samples["down_m"] = np.nan
     axes = make_axes(flight_of(track=track), track, ALL)
@@ -260,7 +260,7 @@ def test_default_evaluated_segment_is_airborne_part_of_source(airborne, expected
     assert segment.reason
 
 
-def test_evaluated_segment_uses_given_start_and_end():
+def test_evaluated_segment_uses_start_and_end_options():
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=((4.0, 12.0),))
     for start_s, end_s in ((5.0, None), (None, 9.0), (3.0, 15.0)):
@@ -371,7 +371,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_axis_aisle_of_wide_track_is_labelled_main_axis() -> None:
+def test_aisle_axis_of_wide_track_is_labelled_main_axis() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the main axis")

@@ -45,7 +45,7 @@ IDEAL = {
 }  # fmt: skip
 
 
-def test_mistake_sizes_all_have_limits() -> None:
+def test_each_simulated_fault_size_has_limits() -> None:
     numbers = {item.name for item in fields(Mistakes) if "float" in str(item.type)}
     assert set(bounds_by_field(Mistakes)) == numbers
 
@@ -109,7 +109,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_simulated_loop_with_open_end_has_given_closure_error(left_out, texts):
+def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse_mistakes(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
@@ -120,7 +120,7 @@ def test_simulated_loop_with_open_end_has_given_closure_error(left_out, texts):
 
 
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
-def test_simulated_aisle_flight_has_given_length_and_yaw_mode(yaw):
+def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
@@ -155,7 +155,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 
 
-def test_simulated_imu_biases_are_constant_with_given_sigma():
+def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
     truth = attitude(simulation.motion.at(imu.index.to_numpy()))
@@ -169,7 +169,7 @@ def test_simulated_imu_biases_are_constant_with_given_sigma():
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
 
-def test_simulated_vio_drift_has_given_rate():
+def test_simulated_vio_drift_has_requested_rate():
     ends = []
     for seed in range(40):
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
@@ -270,7 +270,7 @@ class TestMistakes:
             np.std(position_errors_m(noisy)[:25]) < 0.07
         )  # on the ground; 0.10 m without the filter
 
-    def test_no_vvo_fault_removes_vehicle_visual_odometry(self):
+    def test_simulated_fault_no_vvo_removes_visual_odometry_topic(self):
         remaining = to_flight(simulate(AISLE, parse_mistakes(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_mistakes(["no-vvo"])))
@@ -287,12 +287,12 @@ class TestMistakes:
     ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
     ("no-motion", "no_motion", True),
 ])  # fmt: skip
-def test_parse_mistake_option_converts_units(text, field, value):
+def test_simulate_fault_option_converts_units(text, field, value):
     assert getattr(parse_mistakes([text]), field) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
+def test_simulate_fault_option_is_formatted_and_parsed_back(name):
     parsed = parse_mistakes([name])
     assert active_mistake_names(parsed) == (name,)
     assert parse_mistakes([format_mistake(name, parsed)]) == parsed
@@ -310,7 +310,7 @@ def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
     ("clock-offset=", "give seconds"),
     ("no-motion=1", "give no-motion"),
 ])  # fmt: skip
-def test_parse_invalid_mistake_option_raises_one_line_error(text, expected):
+def test_simulate_invalid_fault_option_raises_one_line_error(text, expected):
     with pytest.raises(SettingsError, match=expected) as error:
         parse_mistakes([text])
     assert "\n" not in str(error.value)
@@ -378,7 +378,7 @@ def test_kf_with_true_noises_is_consistent(errors, off, share):
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_simulated_clean_flight_has_only_notes_as_findings(scenario):
+def test_simulated_clean_flight_reports_only_notes(scenario):
     """The VIO of a loop drifts, which is not a fault; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)

@@ -79,7 +79,7 @@ LOUDER, SCALED = partial(errors.two_levels, factor=6.0), partial(errors.scaled, 
 PASSES = {UNEQUAL: 5, LOUDER: 5, SCALED: 5}
 
 
-def test_white_position_noise_has_no_finding() -> None:
+def test_white_position_noise_is_not_reported() -> None:
     analysis = analysed(errors.white)
     assert root_findings(analysis) == {}
     assert list(detect(analysis)) == []
@@ -111,7 +111,7 @@ def test_simulated_position_noise_is_found_with_type_and_size(
         assert found[name].evidence[key] == pytest.approx(value, abs=within)
 
 
-def test_noise_variation_finding_names_noisy_third_of_flight() -> None:
+def test_noise_variation_report_names_noisy_third_of_flight() -> None:
     analysis = analysed(LOUD)
     ((start, end),) = root_findings(analysis)["source_noise_varies"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
@@ -120,7 +120,7 @@ def test_noise_variation_finding_names_noisy_third_of_flight() -> None:
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-def test_correlated_noise_is_distinguished_from_low_pass() -> None:
+def test_correlated_noise_is_distinguished_from_low_pass_filter() -> None:
     slow, smooth = analysed(SLOW), analysed(SMOOTH)
     assert "source_low_pass_filtered" not in {one.id for one in find(slow)}
     assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
@@ -208,7 +208,7 @@ def test_small_clock_jump_is_not_reported_as_correlated_noise() -> None:
     )
 
 
-def test_low_pass_finding_states_lag_below_time_constant() -> None:
+def test_low_pass_report_states_lag_below_time_constant() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
     found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
@@ -224,7 +224,7 @@ def test_low_pass_finding_states_lag_below_time_constant() -> None:
         ("10hz", UNEQUAL, 1107, "source_noise_unequal_axes"),
     ],
 )
-def test_sitl_flight_with_added_error_has_only_its_finding(
+def test_sitl_flight_with_added_error_reports_only_this_error(
     shared_logs, name, model, seed, finding
 ) -> None:
     log = shared_logs / "simulated" / f"v1.16.1_aisle_{name}.ulg"
@@ -252,7 +252,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
-def test_time_correlation_fit_tries_zero_and_estimated_time_offset(
+def test_time_correlation_fit_tries_zero_and_estimated_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

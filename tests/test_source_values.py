@@ -73,7 +73,7 @@ def test_zero_position_near_the_origin_is_valid():
     assert invalid(samples) == {}
 
 
-def test_positions_sent_twice_are_valid():
+def test_repeated_positions_are_valid():
     samples = track()
     assert invalid(samples.set_axis(samples.index, axis=0).iloc[np.arange(60) // 2 * 2]) == {}
 
@@ -137,7 +137,7 @@ def with_track(flight: Flight, **changes: object) -> Flight:
     return replace(flight, positions=(replace(flight.positions[0], **changes),))
 
 
-def test_invalid_position_finding_states_times_and_effect():
+def test_invalid_position_report_states_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
@@ -151,14 +151,14 @@ def test_invalid_position_finding_states_times_and_effect():
     assert [one.id for one in detected(flight)] == ["source_gap"]
 
 
-def test_single_sample_without_position_is_only_a_note():
+def test_single_sample_without_position_gives_only_a_note():
     invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
     (one,) = detected(with_track(aisle_flight(), invalid=invalid_rows))
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
-def test_rounded_positions_finding_recommends_more_digits(step_m, words):
+def test_rounded_positions_report_recommends_more_digits(step_m, words):
     (one,) = detected(with_track(aisle_flight(), step_m=step_m))
     assert words in one.remedy
 
@@ -226,29 +226,29 @@ def examples() -> Iterator[Finding]:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_each_position_value_fault_is_the_only_finding(name):
+def test_invalid_position_values_are_the_only_reported_fault(name):
     assert [one.id for one in detected(FAULTS[name](aisle_flight()))] == [name]
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_two_senders_finding_states_distance_of_positions(lost):
+def test_two_position_senders_report_states_their_distance(lost):
     (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_copied_ekf2_position_finding_states_the_delay(is_fused):
+def test_report_on_positions_copied_from_ekf2_states_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
     assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
 
 
-def test_valid_positions_of_clean_flight_have_no_finding():
+def test_valid_positions_of_clean_flight_are_not_reported():
     assert detected(aisle_flight()) == ()
 
 
-def test_timestamp_unit_finding_states_that_ekf2_never_fused():
+def test_wrong_timestamp_unit_report_states_ekf2_never_fused():
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
     first, second = detected(with_clock(flight, "milliseconds"))
@@ -257,7 +257,7 @@ def test_timestamp_unit_finding_states_that_ekf2_never_fused():
     assert "the timestamps are in milliseconds" in second.title
 
 
-def test_equal_timestamps_finding_states_clock_resolution():
+def test_equal_timestamps_report_states_clock_resolution():
     (one,) = detected(
         with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS, 120)
     )
@@ -266,7 +266,7 @@ def test_equal_timestamps_finding_states_clock_resolution():
 
 
 @pytest.mark.parametrize(("quality", "words"), [(20.0, "light"), (0.0, "ODOMETRY")])
-def test_not_fusing_finding_states_quality_below_ekf2_ev_qmin(quality, words):
+def test_unfused_vision_report_states_quality_below_ekf2_ev_qmin(quality, words):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
     flight = replace(flight, log=replace(flight.log, parameters=parameters))
@@ -276,7 +276,7 @@ def test_not_fusing_finding_states_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_two_senders_finding_removes_findings_that_depend_on_it():
+def test_two_position_senders_hide_reports_of_their_effects():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -307,7 +307,7 @@ def mounted(arm_m: tuple[float, float]) -> Analysis:
     return replace(analysis, convention=Convention(verdict="determined"))
 
 
-def test_lever_arm_that_does_not_reduce_the_error_is_not_reported(monkeypatch):
+def test_lever_arm_that_does_not_reduce_error_is_not_reported(monkeypatch):
     analysis = mounted((0.4, -0.3))
     monkeypatch.setattr(source_values, "_replayed_effect", lambda *_: None)
     assert not [*source_values.detect_lever_arm(analysis)]
@@ -320,13 +320,13 @@ def test_estimated_lever_arm_equals_simulated_one():
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
 
 
-def test_source_without_lever_arm_has_no_lever_arm_finding():
+def test_source_without_lever_arm_has_no_lever_arm_report():
     assert not [*source_values.detect_lever_arm(mounted((0.0, 0.0)))]
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_findings_of_logged_test_case_equal_expected_findings(name):
+def test_faults_found_in_recorded_logs_equal_expected_faults(name):
     folder = shared("cases")
     case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
     result, first, harmful = judge(case, run(case["command"], folder))

@@ -25,20 +25,20 @@ FINDINGS = Path(__file__).parents[1] / "px4fuse" / "findings"
 
 
 @pytest.mark.parametrize(("words", "kinds"), WORDS_OF_KINDS.items())
-def test_source_words_name_only_sensors_of_their_kind(words, kinds) -> None:
+def test_report_text_names_only_sensors_of_the_source_kind(words, kinds) -> None:
     for kind, texts in SOURCE_WORDS.items():
         if kind not in (*kinds, "file"):
             for text in (getattr(texts, name) for name in texts.__struct_fields__):
                 assert not re.search(words, text, re.IGNORECASE), (kind, text)
 
 
-def test_source_words_exist_for_each_kind_of_source() -> None:
+def test_report_text_exists_for_each_position_source_kind() -> None:
     for kind in PositionKind.__args__:
         source = SimpleNamespace(origin=SimpleNamespace(kind=kind))
         assert source_words(source) is SOURCE_WORDS[kind]  # type: ignore[arg-type]
 
 
-def test_findings_take_words_about_sensors_from_the_table() -> None:
+def test_fault_detectors_contain_no_sensor_specific_words() -> None:
     pattern = re.compile(r"\"[^\"]*(anchor|NLOS|line of sight|marker|reflection|multipath)", re.I)
     for file in FINDINGS.glob("*.py"):
         for line in file.read_text().splitlines():
@@ -53,10 +53,10 @@ def track(rate_hz: float, sigma_m: float) -> PositionTrack:
 @pytest.mark.parametrize(("rate_hz", "sigma_m", "kind"), [
     (5.0, 0.1, "uwb"), (20.0, 0.05, "uwb"), (100.0, 0.1, "unknown"), (10.0, 0.003, "unknown"),
 ])  # fmt: skip
-def test_kind_without_orientation_depends_on_noise_and_rate(rate_hz, sigma_m, kind) -> None:
+def test_position_source_kind_is_guessed_from_noise_and_rate(rate_hz, sigma_m, kind) -> None:
     assert kind_without_orientation(track(rate_hz, sigma_m).samples) == kind
 
 
-def test_kind_of_few_positions_is_unknown() -> None:
+def test_position_source_kind_of_few_samples_is_unknown() -> None:
     samples = pd.DataFrame(np.zeros((3, 3)), [0.0, 1.0, 2.0], Columns.POSITION)
     assert kind_without_orientation(samples) == "unknown"

@@ -118,7 +118,7 @@ def all_texts() -> Iterator[tuple[str, str, int, bool]]:
             yield path.relative_to(REPOSITORY).as_posix(), text, line, in_code
 
 
-def test_texts_contain_no_rejected_phrase() -> None:
+def test_documentation_and_messages_contain_no_banned_phrase() -> None:
     hits = [
         f"{name}:{line}: {match[0]!r} -> {phrase.alternative}"
         for name, text, line, in_code in all_texts()
@@ -149,5 +149,5 @@ def test_docstrings_begin_with_an_imperative_or_noun() -> None:
         ("errors against ground truth", False),
     ],
 )
-def test_rejected_phrase_patterns_match_their_examples(text: str, is_rejected: bool) -> None:
+def test_banned_phrase_patterns_match_their_examples(text: str, is_rejected: bool) -> None:
     assert any(phrase.pattern.search(text) for phrase in PHRASES) == is_rejected

@@ -94,11 +94,11 @@ def test_find_submissions_searches_folders_recursively(tmp_path):
         ("flight_lab_reports_2026/r.pdf", ("", "")),
     ],
 )  # fmt: skip
-def test_student_name_is_read_from_platform_part_of_file_name(name, is_):
+def test_student_name_is_read_from_learning_platform_file_name(name, is_):
     assert name_and_number(name) == is_
 
 
-def test_submission_file_name_gives_login_time_and_late_mark():
+def test_submission_file_name_gives_login_time_and_lateness():
     blackboard = parse_origin("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
     assert parse_origin("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
@@ -181,7 +181,7 @@ def test_find_submissions_reads_times_of_zip_entries(tmp_path):
     assert times == {"a.pdf": "2026-11-20T12:34:56", "b.pdf": None}
 
 
-def test_find_submissions_does_not_open_zip_inside_export(tmp_path):
+def test_find_submissions_does_not_open_nested_zip(tmp_path):
     name = "Roe_1_assignsubmission_file_/work.zip"
     handed_in = zipped({"report.pdf": PDF, "more.zip": zipped({"deep.pdf": PDF})})
     export = write(tmp_path / "all.zip", zipped({name: handed_in, "log.ulg": b""}))
@@ -350,7 +350,7 @@ def test_read_submission_from_unsupported_zip_states_reason(tmp_path):
     assert reason(by_name["same.pdf"]).endswith("(No such file or directory).")
 
 
-def test_find_submissions_refuses_two_entries_of_equal_name(tmp_path):
+def test_find_submissions_rejects_zip_with_equal_entry_names(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
         archive.writestr("same.pdf", b"first")
         with pytest.warns(UserWarning, match="Duplicate"):

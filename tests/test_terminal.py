@@ -161,7 +161,7 @@ def test_printed_command_lines_run_when_pasted_in_a_shell(desk, monkeypatch, typ
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_command_printed_by_a_finding_removes_that_finding(desk) -> None:
+def test_command_advised_for_a_fault_removes_that_fault(desk) -> None:
     first = run_checked("compare", "l.ulg", "--sigma-z", "0.12")
     assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
     command = next(command for command in commands(first.stdout) if "--clock-offset" in command)

@@ -127,7 +127,7 @@ def test_loop_g2o_file_contains_the_optimised_pose_graph(made, found, tmp_path) 
     assert cost == pytest.approx(corrections["pose_graph_all"]["cost"], rel=1e-3)
 
 
-def test_loop_results_contain_repeatable_command(desk, tmp_path) -> None:
+def test_loop_results_json_contains_command_to_repeat_run(desk, tmp_path) -> None:
     given = ["--landed-at", "0.1,-0.2,5", "--drift", "2"]
     given += ["--closure", "10,50", "--closure", " 20, 60,0.2"]
     found = results("loop", desk / "s.tum", *given)

@@ -89,7 +89,7 @@ def test_wrong_noises_show_likelihood_gain_on_held_out_data() -> None:
         assert one == pytest.approx(two, rel=1e-4)
 
 
-def test_tune_with_two_axes_narrows_the_noise_interval() -> None:
+def test_tuned_noise_interval_of_two_axes_is_root_2_narrower() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
         both = tuned(north, east)

@@ -147,7 +147,7 @@ def move_lines(pdf: bytes, by: float) -> bytes:
 
 
 @pytest.mark.parametrize("which", ["aisle", "loop"])
-def test_verify_report_from_other_platform_is_verified(
+def test_verify_accepts_report_of_other_operating_system(
     which: str, request: pytest.FixtureRequest
 ) -> None:
     one: VerifiedReport = request.getfixturevalue(which)
@@ -353,7 +353,7 @@ def foreign(loop: VerifiedReport) -> VerifiedReport:
     return VerifiedReport(forged(drawn, with_results(to_json(results))), results, again, loop.files)
 
 
-def test_verify_report_made_with_other_libraries_is_verified(foreign: VerifiedReport) -> None:
+def test_verify_accepts_report_of_other_library_versions(foreign: VerifiedReport) -> None:
     verdict = foreign.verified(foreign.pdf)
     assert verdict.outcome == "verified", verdict
     assert foreign.verified(forged(foreign.pdf, shifted_page)).outcome == "verified"
@@ -385,7 +385,7 @@ PLOTS: dict[str, Edit] = {
 
 
 @pytest.mark.parametrize("name", PLOTS)
-def test_verify_finds_changed_plot_despite_other_libraries(
+def test_verify_detects_changed_plot_with_other_library_versions(
     foreign: VerifiedReport, name: str
 ) -> None:
     verdict = foreign.verified(forged(foreign.pdf, on_page(1, PLOTS[name])))

@@ -548,7 +548,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "changes of the vision position" in refused.reason
 
 
-def test_kf_ekf2_explanation_on_gnss_flight_includes_vision() -> None:
+def test_kf_ekf2_difference_on_gnss_flight_includes_vision() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -89,7 +89,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
             what_if(model, [], without)
 
 
-def test_whatif_command_without_set_keeps_parameters_that_fit(estimated: WhatIfAnalysis) -> None:
+def test_what_if_without_set_option_keeps_consistent_parameters(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
@@ -174,7 +174,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
-    def test_what_if_on_log_without_agreement_raises_missing_data(
+    def test_what_if_without_replay_agreement_raises_missing_data(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):

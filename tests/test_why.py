@@ -47,7 +47,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     )
 
 
-def test_kf_setting_changes_only_its_part_of_kf_ekf2_difference(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_share_of_ekf2_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES
@@ -63,7 +63,7 @@ def test_kf_setting_changes_only_its_part_of_kf_ekf2_difference(sample: Analysis
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
 
-def test_kf_ekf2_explanation_covers_only_evaluated_segment(sample: Analysis) -> None:
+def test_kf_ekf2_difference_uses_only_evaluated_segment(sample: Analysis) -> None:
     explanation = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
     assert explanation.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
     assert explanation.spans_s[0][1] == pytest.approx(60.0, abs=0.3)
@@ -85,7 +85,7 @@ def drawn(analysis: Analysis) -> list:
         return list(draw(analysis, None))
 
 
-def test_report_without_agreeing_replay_has_no_difference_page(sample: Analysis) -> None:
+def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> None:
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(
@@ -111,7 +111,7 @@ def test_report_without_agreeing_replay_has_no_difference_page(sample: Analysis)
     ("share", "text"),
     [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %; other properties")],
 )
-def test_kf_ekf2_difference_sentence_states_largest_step(sample, share, text) -> None:
+def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:
     explanation = of(sample)
     first, whole = explanation.steps[0], explanation.position_mean_square_m2
     shares = [share, *[1e-3] * (len(explanation.steps) - 1)]

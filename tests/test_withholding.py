@@ -49,7 +49,7 @@ def assigned(tmp_path_factory: pytest.TempPathFactory) -> Assigned:
     return Assigned(log, report, results)
 
 
-def test_report_of_assignment_contains_answers_not_findings(assigned: Assigned) -> None:
+def test_report_on_assigned_flight_contains_no_diagnosis(assigned: Assigned) -> None:
     results = assigned.results
     assert results.log.is_assessed is True
     assert (results.findings, results.trials, results.card.causes) == ((), (), ())
@@ -70,18 +70,24 @@ def test_report_of_assignment_contains_answers_not_findings(assigned: Assigned) 
         "compare {log} --clock-offset auto",
     ],
 )
-def test_estimate_for_assignment_is_refused_in_one_line(assigned: Assigned, command: str) -> None:
+def test_parameter_estimate_for_assigned_flight_is_refused(
+    assigned: Assigned, command: str
+) -> None:
     assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
 
 
-def test_loop_of_assignment_has_no_closure(assigned: Assigned, tmp_path: Path) -> None:
+def test_loop_report_on_assigned_flight_has_no_loop_closure(
+    assigned: Assigned, tmp_path: Path
+) -> None:
     run_checked("loop", assigned.log, "--json", tmp_path / "loop.json")
     data = json.loads((tmp_path / "loop.json").read_text(encoding="utf-8"))
     assert data["loop"]["true_end"]["reason"] == DIAGNOSIS_WITHHELD.reason
     assert (data["loop"]["closures"], data["findings"]) == ([], [])
 
 
-def test_grade_adds_diagnosis_to_report_of_assignment(assigned: Assigned, tmp_path: Path) -> None:
+def test_grade_adds_diagnosis_to_report_on_assigned_flight(
+    assigned: Assigned, tmp_path: Path
+) -> None:
     logs, pdf = files_by_sha256([assigned.log]), assigned.report.read_bytes()
     assigned_hashes = frozenset(logs)
     results, verdict, _ = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
@@ -93,7 +99,9 @@ def test_grade_adds_diagnosis_to_report_of_assignment(assigned: Assigned, tmp_pa
     assert to_json(again) == to_json(results)
 
 
-def test_report_of_log_without_mark_is_not_verified(assigned: Assigned, tmp_path: Path) -> None:
+def test_report_on_log_with_removed_assignment_key_is_rejected(
+    assigned: Assigned, tmp_path: Path
+) -> None:
     copy = tmp_path / assigned.log.name
     key = ASSESSED_KEY.encode()
     copy.write_bytes(assigned.log.read_bytes().replace(key, b"x" * len(key)))
@@ -104,7 +112,7 @@ def test_report_of_log_without_mark_is_not_verified(assigned: Assigned, tmp_path
     assert "other log" in result.stdout
 
 
-def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
+def test_answer_form_prediction_questions_have_sorted_ranges() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s1"), "aisle", 1)
     assert answer.form is not None
     predictions = answer.form.predictions
@@ -115,7 +123,7 @@ def test_predictions_need_other_simulations_and_have_random_ranges() -> None:
     assert len({letter for _, letter in predictions}) > 1
 
 
-def test_predictions_outweigh_a_diagnosis_without_evidence() -> None:
+def test_answer_form_without_predictions_earns_part_of_points() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)

@@ -312,7 +312,7 @@ def test_output_to_existing_folder_name_is_refused(tmp_path, capsysbinary) -> No
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
-def test_compare_warns_before_drawing_if_name_has_no_font(
+def test_compare_warns_if_no_font_can_print_student_name(
     desk, monkeypatch, capsys, name: str, said: bool
 ) -> None:
     warnings = []
@@ -370,7 +370,7 @@ def test_terminal_output_to_closed_pipe_exits_with_0(desk, command) -> None:
 # --- --clock-offset auto ---
 
 
-def test_clock_offset_auto_is_zero_if_not_significant(sample_log) -> None:
+def test_option_clock_offset_auto_applies_0_if_not_significant(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
     found = compare_prepared(prepare_comparison(request))
     assert found.settings.clock_offset_s == 0.0
@@ -380,7 +380,7 @@ def test_clock_offset_auto_is_zero_if_not_significant(sample_log) -> None:
 
 
 @pytest.mark.reallogs
-def test_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
+def test_option_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
     request = ComparisonRequest(
         log=str(shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"), axes=("aisle",)
     )
