@@ -127,7 +127,7 @@ CHECKED = [
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "settings do not make KF consistent"),
-    ("clock", EXAMPLE, {}, 1.0, "interval of the estimate is -0.022 to 0.061 s"),
+    ("clock", EXAMPLE, {}, 1.0, "interval of the estimate is -0.022 to 0.060 s"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),

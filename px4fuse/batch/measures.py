@@ -44,7 +44,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # aiding sources of the position source: the numbers of each axis contain theirs
+    # aiding sources of the position source: the results of each axis contain their numbers
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         source_aids = ("gnss_pos",)
