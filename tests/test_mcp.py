@@ -148,7 +148,8 @@ def test_mcp_server_returns_each_listed_resource(tmp_path: Path, serve: Any) -> 
         assert texts.keys() == {f"px4fuse://findings/{name}" for name in CATALOGUE}
         listed = text_of(await client.call_tool("list_findings", {}))
         for name, entry in CATALOGUE.items():
-            assert texts[f"px4fuse://findings/{name}"].startswith(f"{entry.title}  [{name}]")
+            words = " ".join(texts[f"px4fuse://findings/{name}"].split())
+            assert words.startswith(f"{entry.title} [{name}]")
             assert name in listed
         page = text_of(await client.call_tool("explain", {"finding_id": "source_outliers"}))
         assert page == texts["px4fuse://findings/source_outliers"]
