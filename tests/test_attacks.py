@@ -44,6 +44,8 @@ from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import cannot_verify
 
+ASK = "Ask the author how the report was made"  # beginning of the action for a forged report
+
 pytestmark = pytest.mark.usefixtures("cached_analyses", "_compare_pages_in_process")
 
 MISTAKES = ("nlos=3%", "dropout=5s,30s")
@@ -222,7 +224,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         set_value("9.9", "schema", "version"), "cannot verify",
         "read it with px4fuse",
     ),
-    "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
+    "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", ASK),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
     "log of another student": (
         set_value("b" * 64, "log", "sha256"), "other log", "assigned to student s02",
@@ -234,13 +236,13 @@ FILES: dict[str, tuple[Change, str, str]] = {
     "other settings": (set_value(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
     "another part of the flight": (set_value(20.0, "request", "start_s"), "numbers differ", ""),
     "setting out of range": (
-        set_value(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
+        set_value(1e9, "request", "sigma_a_m_s2"), "cannot verify", ASK,
     ),
-    "path as log": (set_value("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
-    "log is parent folder": (set_value("..", "request", "log"), "cannot verify", "Ask how"),
-    "DT too small": (set_value(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
+    "path as log": (set_value("../../etc/passwd", "request", "log"), "cannot verify", ASK),
+    "log is parent folder": (set_value("..", "request", "log"), "cannot verify", ASK),
+    "DT too small": (set_value(1e-9, "request", "dt_s"), "cannot verify", ASK),
     "ten thousand lines of notes": (
-        set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
+        set_value("a\n" * 10_000, "student", "notes"), "cannot verify", ASK,
     ),
     # the cover prints the id, and its font contains the letters of the cover only
     "the id of another student": (forge_owner, "cannot verify", "assigned to student s01"),

@@ -65,7 +65,7 @@ def test_compare_report_pdf_attaches_results_without_paths(report):
 def test_compare_report_prints_special_characters_of_student(report):
     pages = [page.extract_text() for page in pypdf.PdfReader(report[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
-    assert "Costs $5 and x^2 or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
+    assert "Costs $5 and $x^2$ or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
     assert sum("line line line" in page for page in pages) > 1  # long notes need several pages
 
 

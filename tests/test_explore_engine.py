@@ -78,7 +78,7 @@ def in_browser(
         for at, one in tries
     ]  # fmt: skip
     values = {
-        "text": packer.text(), "specs": packer.specs, "flight": json.dumps(flight),
+        "text": packer.text(), "specs": packer.array_specs, "flight": json.dumps(flight),
         "tries": tries_for_page,
     }  # fmt: skip
     return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
@@ -162,7 +162,7 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     packer.add_times(np.array([0.1, 0.2, 123.456789]))
     unpacked = ask(
         engine,
-        f"Engine.unpack({json.dumps(packer.text())}, {json.dumps(packer.specs)})"
+        f"Engine.unpack({json.dumps(packer.text())}, {json.dumps(packer.array_specs)})"
         ".then((all) => all.map((one) => Array.from(one)))",
     )
     for back, values in zip(unpacked, arrays, strict=False):

@@ -83,7 +83,7 @@ def test_explore_page_on_phone_fits_diagnosis_and_plot(
     settle(browser)
     wanted = ["#card h2", "#card figure", "#views", ".legend", "#innovation", *SLIDERS[:2]]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
-    browser.ask("document.querySelector('aside').scrollTo(0, 1e4)")
+    browser.ask("document.querySelector('#ekf2-r').scrollIntoView()")
     settle(browser)
     assert browser.ask(f"({IN_VIEW})('#ekf2-r')") == ["#ekf2-r"]
     assert browser.complaints() == []

@@ -106,7 +106,7 @@ def test_read_mavlink_of_simulated_flight_equals_closed_form(read):
     assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
     [track] = flight.positions
     assert track.name == "VISION_POSITION_ESTIMATE"
-    assert (track.origin, track.frame) == (RECEIVED, "NED")
+    assert (track.origin.path, track.frame) == (RECEIVED.path, "NED")
     variance = track.samples[Columns.POSITION_VARIANCE]
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
@@ -259,7 +259,7 @@ def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, na
         assert "no ODOMETRY sent to the autopilot" in reason(flight, "position source ODOMETRY")
         return
     [track] = flight.positions
-    assert (track.name, track.origin, track.topics) == (name, origin, ("ODOMETRY",))
+    assert (track.name, track.origin.path, track.topics) == (name, origin.path, ("ODOMETRY",))
     assert len(track.samples) == 200
     assert len(flight.ekf2.state) == 800
     given = track.samples[Columns.POSITION_VARIANCE]

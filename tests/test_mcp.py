@@ -58,6 +58,12 @@ posix = pytest.mark.skipif(os.name == "nt", reason="links and named pipes are th
 Talk = Callable[[Client], Awaitable[None]]
 
 
+@pytest.fixture(autouse=True)
+def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Set a width at which titles and ids are not wrapped; pytest-xdist sets another one."""
+    monkeypatch.setenv("COLUMNS", "120")
+
+
 def connect(server: Any, talk: Talk, mode: str = "auto") -> None:
     """Connect a client to a server, and run a conversation."""
 
@@ -148,8 +154,9 @@ def test_mcp_server_returns_each_listed_resource(tmp_path: Path, serve: Any) -> 
         assert texts.keys() == {f"px4fuse://findings/{name}" for name in CATALOGUE}
         listed = text_of(await client.call_tool("list_findings", {}))
         for name, entry in CATALOGUE.items():
-            words = " ".join(texts[f"px4fuse://findings/{name}"].split())
-            assert words.startswith(f"{entry.title} [{name}]")
+            page = texts[f"px4fuse://findings/{name}"]
+            # the title is wrapped at the width of the terminal
+            assert "".join(page.split()).startswith("".join(f"{entry.title}[{name}]".split()))
             assert name in listed
         page = text_of(await client.call_tool("explain", {"finding_id": "source_outliers"}))
         assert page == texts["px4fuse://findings/source_outliers"]
@@ -363,7 +370,7 @@ def test_mcp_server_runs_one_analysis_at_a_time(tmp_path: Path) -> None:
 
     connect(started(folder=tmp_path), talk)
     logs = [log for log, _ in activities]
-    assert len(logs) >= 4
+    assert {*logs} == {"1.ulg", "2.ulg"}
     assert logs == sorted(logs, key=logs.index)
 
 
