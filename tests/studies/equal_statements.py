@@ -209,11 +209,14 @@ def json_trials(outputs: Outputs) -> Iterator[Statement]:
     for trial in outputs["json"]["trials"]:
         surface, before = f"before of {'+'.join(trial['kinds'])}", trial["before"]
         when = "" if trial.get("from_s") is None else ", time of replay"
+        # of an axis on which the replay differs from the log, the numbers are from the replay
+        basis = "" if trial.get("is_logged", True) else ", replay"
         axis = "the main axis" if trial["axis"] == "aisle" else trial["axis"]
         fact = f"{trial['filter']} {axis}{when}"
         for name, field, power in (
             (f"σ ratio {fact}", "nis_mean", 0.5), (f"truth ratio {fact}", "nees_mean", 0.5),
-            (f"RMSE {fact}", "position_rmse_m", 1.0), (f"rejected{when}", "rejected_fraction", 1.0),
+            (f"RMSE {fact}", "position_rmse_m", 1.0),
+            (f"rejected{when}{basis}", "rejected_fraction", 1.0),
         ):  # fmt: skip
             if before.get(field) is not None:
                 yield Statement(name, surface, before[field] ** power)
