@@ -88,7 +88,7 @@ def test_compare_options_written_as_json_are_read_back_equal(request: Request) -
     assert msgspec.json.decode(msgspec.json.encode(request), type=Request) == request
 
 
-def test_compare_options_without_paths_keep_only_file_names() -> None:
+def test_command_in_report_names_input_files_without_folders() -> None:
     request = ComparisonRequest(log="/home/eve/a.ulg", position=PositionFile(path="../d.csv"))
     assert command_line(request) == "px4fuse compare a.ulg --position d.csv"
     assert "eve" not in msgspec.json.encode(request.without_paths()).decode()

@@ -266,7 +266,7 @@ def _fit_source_errors(
 def _horizontal_axes(
     comparison: Comparison, tuning: Tuning
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
-    """Return the horizontal axes that have a noise estimate, and this estimate."""
+    """Return the horizontal axes that have a noise estimate, with the estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):

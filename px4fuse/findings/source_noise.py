@@ -75,7 +75,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     ):
         evidence[WHITE_RATIO] = white_noise_ratio
     # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
-    make_finding = note if is_gnss and not _exceeds_reported_sigma(analysis) else warning
+    make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
@@ -87,7 +87,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     )
 
 
-def _exceeds_reported_sigma(analysis: Analysis) -> bool:
+def _has_error_above_reported_sigma(analysis: Analysis) -> bool:
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)

@@ -33,9 +33,9 @@ WINDOW_SAMPLES = 16
 # Minimum number of windows for detecting two senders: in fewer windows, outliers of one sender
 # resemble a second sender
 MIN_WINDOWS = 10
-# Maximum median distance (m) between EKF2's position and a source that is its copy
+# Maximum median distance (m) between EKF2's position and a source that sends this position back
 MAX_COPY_DISTANCE_M = 0.01
-# Maximum median distance (m) between EKF2's position and a source that is its copy and is fused
+# The same maximum (m) if EKF2 fuses the source, because EKF2 then follows any source
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Minimum speed (m/s) for detecting a copy: at rest any source may equal EKF2's position
 MIN_COPY_SPEED_M_S = 0.2

@@ -33,7 +33,7 @@ MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return the descriptions of all missing data of a flight, also inside :class:`Ekf2`."""
+    """Return the missing data of a flight and of its EKF2 data, each with its reason."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusion_flags)

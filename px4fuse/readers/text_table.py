@@ -28,8 +28,8 @@ _NUMBER = re.compile(
 def decode_text(content: bytes) -> str | None:
     """Decode text and convert its line ends to line feeds.
 
-    The encoding is UTF-8, UTF-16 with byte order mark, or Latin-1 for all other bytes. Return None
-    if the content is binary.
+    The encoding is UTF-8, UTF-16 with byte order mark, otherwise Latin-1. Return None if the
+    content is binary.
     """
     if content.startswith(_UTF_16_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")

@@ -92,7 +92,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     page.legend(axes.get_legend_handles_labels()[0])
     page.heading("Loop closures and scores")
     page.write(
-        "d²: squared Mahalanobis distance of the closure given drift and closure "
+        "d²: squared Mahalanobis distance of the closure error, from drift and closure "
         "noise. p: probability of a larger d² for a true closure. GNC weight: "
         "1 if the closure is used, 0 if it is excluded.",
         colour=MUTED_COLOUR,

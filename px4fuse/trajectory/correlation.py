@@ -72,7 +72,7 @@ def autocovariance(values: Array | Complex) -> Array:
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """Compute Σ a conj(b) over the common samples, at each lag.
 
-    Like ``scipy.signal.correlate``, whose import takes 0.3 s.
+    The result equals that of ``scipy.signal.correlate``, whose import takes 0.3 s.
     """
     size = len(a) + len(b) - 1
     is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)

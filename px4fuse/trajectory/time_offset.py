@@ -32,8 +32,8 @@ SMOOTHING_S = 0.25
 MIN_OVERLAP_S = 5.0
 # Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
-# Minimum number of overlapping poses, as fraction of the poses in the time span of the shorter
-# trajectory
+# Minimum ratio of the number of overlapping poses to the number of poses in the time span of the
+# shorter trajectory
 MIN_POSES_FRACTION = 0.3
 # Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
 MAX_CANDIDATES = 12
