@@ -22,7 +22,7 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
-from px4fuse.filter.signals import Axis, Segment
+from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight.model import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
 
 STATE_COLUMNS = ("position_m", "velocity_m_s")
@@ -33,9 +33,14 @@ Frame = pd.DataFrame | Unavailable
 def run_kf(
     prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
-    """Run KF along each axis of a comparison, and return the runs by axis name."""
-    progress(f"running KF along the axes {', '.join(line.name for line in prepared.lines)}")
-    return {line.name: replay(line, prepared.settings) for line in prepared.lines}
+    """Run KF along each axis (the main axis with filterpy); return the runs by axis name."""
+    names = [line.name for line in prepared.lines]
+    progress(f"running KF along the axes {', '.join(names)}")
+    main_name = AISLE if AISLE in names else names[0]
+    return {
+        line.name: replay(line, prepared.settings, fast=line.name != main_name)
+        for line in prepared.lines
+    }
 
 
 def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
