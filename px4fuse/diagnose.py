@@ -32,7 +32,7 @@ from px4fuse.comparison.estimates import (
     ignore_progress,
 )
 from px4fuse.comparison.flight_events import collect_events
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
@@ -62,7 +62,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, explain the differences and find faults.
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 7).
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ def diagnose(
     prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
     kf_runs = run_kf(prepared, progress)
     comparison = compare(prepared, kf_runs)
-    return replace(explain(comparison, progress), request=request)
+    return replace(find_faults(comparison, progress), request=request)
 
 
-def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Explain a comparison: estimate errors, re-run the filters without each error, find faults.
+def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Find the faults of a flight (steps 5 to 7): estimate errors, re-run filters, find causes.
 
     For a flight that is an assignment, the result contains only the comparison.
     """
@@ -180,7 +180,7 @@ def prepare_comparison(
     flight: Flight | None = None,
     *,
     as_sent: bool = False,
-) -> Comparison:
+) -> PreparedComparison:
     """Choose position source, time span, axes and time offset of a flight, before KF runs.
 
     Arguments and errors are those of :func:`diagnose`.

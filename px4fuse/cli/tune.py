@@ -12,7 +12,7 @@ from px4fuse.cli.outputs import check_targets, progress, result_files, write_and
 from px4fuse.core.record import Unavailable
 
 if TYPE_CHECKING:
-    from px4fuse.comparison.model import Comparison
+    from px4fuse.comparison.model import PreparedComparison
     from px4fuse.filter.tuning import AxisTuning
     from px4fuse.report.page import Page
 
@@ -65,7 +65,9 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     write_and_print(result_files(results, json_path), _tuning_page(comparison, tunings), request)
 
 
-def _tuning_page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
+def _tuning_page(
+    comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
+) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
     from px4fuse.report.style import MUTED_COLOUR

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import max_interval_s
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, to_json_types, utc_time
@@ -218,7 +218,9 @@ def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unav
     return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
 
 
-def _list_sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
+def _list_sources(
+    flight: Flight, comparison: PreparedComparison | None, reason: str
+) -> Iterator[Source]:
     data_by_stream = _data_by_stream(flight)
     for key, name in DATA_LABELS.items():
         if key in data_by_stream:
@@ -280,7 +282,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
 
 
 def _list_options(
-    flight: Flight, comparison: Comparison | None, reason: str
+    flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
     if comparison is None:
         yield AnalysisOption("compare", False, reason)
@@ -325,13 +327,13 @@ def _make_option(name: str, data: object, description: str) -> AnalysisOption:
 
 
 def _analyses_against_ekf2_and_truth(
-    flight: Flight, comparison: Comparison | None
+    flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that compare KF with EKF2 and with ground truth."""
     data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
-        main_line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
+        main_line, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
         state, variance, truth = project_tracks(
             ekf2, comparison.flight.truth, main_line, segment
         ).values()
@@ -350,7 +352,7 @@ def _analyses_against_ekf2_and_truth(
 
 
 def _logging_advice(
-    flight: Flight, comparison: Comparison | None, remedy: str
+    flight: Flight, comparison: PreparedComparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings on the recording and of missing data, each action once."""
     if flight.log.is_assessed:
