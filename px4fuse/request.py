@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
+from px4fuse.core.text import replace_unencodable
+
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF: process noise, measurement noise and prediction interval
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
@@ -375,4 +377,4 @@ def _file_name(path: str) -> str:
     Bytes that are not UTF-8 become question marks.
     """
     file, topic, _ = re.split(r"((?<=..):/.*|$)", path, maxsplit=1, flags=re.DOTALL)
-    return PurePath(file).name.encode(errors="replace").decode() + topic
+    return replace_unencodable(PurePath(file).name) + topic

@@ -2,17 +2,15 @@
 
 import sys
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import LogError, MissingDataError
+from px4fuse.finding import SEVERITIES, Severity
 from px4fuse.request import settings_name
-
-Severity = Literal["error", "warning", "note"]
-SEVERITIES = get_args(Severity)
 
 
 @click.command()
@@ -69,9 +67,14 @@ def compare(
             outcome = diagnose_or_check_aids(request, show_progress)
             results = outcome_results(request, outcome, student)
             release_free_memory()  # the report modules, imported next, need memory
-            if output is None and json_path is None:
-                output = outputs.default_report(log.stem, settings_name(request), results)
-            contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+            contents = outputs.result_files(
+                results,
+                json_path,
+                output,
+                outcome,
+                show_progress,
+                log.stem + settings_name(request),
+            )
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # programs that read standard error expect one line
             raise
@@ -86,10 +89,5 @@ def compare(
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if failed_findings:
         sys.exit(1)
-    if fail_on is not None:
-        failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(
-            finding.severity in failing_severities and finding.caused_by is None
-            for finding in results.findings
-        ):
-            sys.exit(1)
+    causes = [finding for finding in results.findings if finding.caused_by is None]
+    options.exit_for_severity(fail_on, SEVERITIES, {finding.severity for finding in causes})

@@ -124,10 +124,8 @@ def evaluate(
             **{name: option_values[name] for name in SCORE_OPTIONS},
         )
         results = evaluation_results(request, evaluation)
-        if output is None and json_path is None:
-            name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = outputs.default_report(name, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, evaluation, show_progress)
+        name = f"{file_name(estimate)}_against_{file_name(reference)}{settings_name(request)}"
+        contents = outputs.result_files(results, json_path, output, evaluation, show_progress, name)
     page = Page()
     write_evaluation(page, evaluation)
     outputs.write_and_print(contents, page)

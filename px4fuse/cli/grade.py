@@ -1,10 +1,8 @@
 """Command ``px4fuse grade``: verifies and grades the reports of a class."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import click
 
@@ -21,10 +19,6 @@ from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_ne
 from px4fuse.core.input_files import add_input, check_output_folder
 from px4fuse.core.reading import files_below
 from px4fuse.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from px4fuse.classroom.grading.grade import GradeOutcome
-    from px4fuse.report.page import Page
 
 
 @click.command()
@@ -161,6 +155,7 @@ def grade(
     from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
     from px4fuse.classroom.grading.grade import grade as grade_submissions
     from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
+    from px4fuse.classroom.terminal import grading_page
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
@@ -205,7 +200,7 @@ def grade(
     except KeyboardInterrupt as interrupt:
         message = f"results of verified reports are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
-    write_and_print({}, _grading_page(outcome), written_files=outcome.written_paths)
+    write_and_print({}, grading_page(outcome), written_files=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
@@ -222,41 +217,3 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
         for file in files_below(path):
             add_input(file)
     check_output_folder(output)
-
-
-def _grading_page(outcome: GradeOutcome) -> Page:
-    from collections import Counter
-
-    from px4fuse.core.text import one_line
-    from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-
-    page, rows = Page(), []
-    for entry in outcome.entries:
-        attempt = entry.counted_report
-        pending = ", pending" if attempt and entry.total is None else ""
-        status = attempt.status + pending if attempt else "missing"
-        status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
-        total = "–" if entry.total is None else f"{entry.total:g}"
-        name = one_line(entry.student or entry.student_id, 60)
-        file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
-    page.table(
-        ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
-    )
-    counts = Counter(attempt.status for attempt in outcome.reports)
-    status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing_count = sum(entry.counted_report is None for entry in outcome.entries)
-    page.write(
-        f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
-        f"{outcome.reused_count} submissions"
-    )
-    for entry in outcome.entries:
-        report = entry.counted_report
-        if report is not None and entry.total is None:
-            name = one_line(entry.display_name, 60)
-            page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
-    for note in outcome.notes:
-        page.write(note, colour=MUTED_COLOUR)
-    return page

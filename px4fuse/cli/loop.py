@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from px4fuse.cli import options, outputs
-from px4fuse.core.reading import display_name
+from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
-from px4fuse.errors import SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.request import (
     FrameName,
     GivenClosure,
@@ -166,7 +166,6 @@ def loop(
     (g2o), which is optimised. LOG:vio, LOG:ekf2 or LOG:kf selects the track of a log; the default
     is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.core.reading import split_path_and_part
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o
     from px4fuse.report.loop import summary
@@ -180,19 +179,17 @@ def loop(
                 f"{name} cannot write to standard output, only --json can", "Give a file name."
             )
     if is_g2o(log):
-        _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
+        _solve_graph(source, json_path, g2o, option_values["robust"] or None)
         return
     request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as show_progress:
         loop_result = analyse_loop_closure(request, show_progress)
         results = loop_results(request, loop_result, student)
-        if output is None and json_path is None:
-            output = outputs.default_report(
-                f"{file_name(source)}_loop", settings_name(request), results
-            )
-        contents = _output_files(loop_result, tum, g2o)
-        contents |= outputs.result_files(results, json_path, output, loop_result, show_progress)
+        name = f"{file_name(source)}_loop{settings_name(request)}"
+        contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
+            results, json_path, output, loop_result, show_progress, name
+        )
     outputs.write_and_print(contents, summary(loop_result, results.findings), request)
 
 
@@ -206,7 +203,6 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
     """Return the contents of the files with the corrected path (TUM) and the pose graph (g2o)."""
-    from px4fuse.errors import MissingDataError
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
@@ -230,7 +226,6 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.core.reading import split_path_and_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -19,6 +20,7 @@ from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
+from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
@@ -184,8 +186,14 @@ def report_options(text: str) -> Option:
     return _combine_options(output_option("FILE.pdf", text), _json_option(json_text))
 
 
-def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    return click.option("--fail-on", type=Choice(severities), help=text)
+def fail_option(levels: tuple[str, ...], text: str) -> Option:
+    return click.option("--fail-on", type=Choice(levels), help=text)
+
+
+def exit_for_severity(fail_on: str | None, levels: Sequence[str], reached: Iterable[str]) -> None:
+    """Exit with code 1 if the level of --fail-on or a more severe level is reached."""
+    if fail_on is not None and {*reached}.intersection(levels[: levels.index(fail_on) + 1]):
+        sys.exit(1)
 
 
 def _open_flag(*names: str) -> Option:
@@ -406,8 +414,10 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     from px4fuse.results.answer_form import read_answers
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
-    name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
-    notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
+    name, student_id, notes_path, answers_path = (
+        option_values.pop(name) for name in ("student", "student_id", "notes", "answers")
+    )
+    notes = ""
     if notes_path is not None:
         from px4fuse.report.notes import parse  # imported on demand, because it is slow
 
@@ -419,7 +429,8 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
             f"--answers {answers_path} was made for another log than {log.name}.",
             f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
         )
-    student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
+    name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
+    student = Student(name, student_id, notes, answers)
     _warn_missing_fonts(student.name + student.id + student.notes)
     return student
 
@@ -431,8 +442,3 @@ def _warn_missing_fonts(text: str) -> None:
 
     if characters := missing_characters(text):
         click.echo(f"px4fuse: {font_advice(characters)}", err=True)
-
-
-def replace_unencodable(text: str) -> str:
-    """Replace bytes of a command line that are not valid UTF-8 by question marks."""
-    return text.encode(errors="replace").decode()

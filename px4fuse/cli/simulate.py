@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,13 +20,8 @@ from px4fuse.cli.options import (
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
-from px4fuse.errors import OutputError, SettingsError, to_one_line
-from px4fuse.simulation.mistakes import (
-    MISTAKES,
-    active_mistake_names,
-    format_mistake,
-    parse_mistakes,
-)
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
     Scenario,
@@ -39,13 +33,10 @@ from px4fuse.simulation.scenario import (
 
 if TYPE_CHECKING:
     from px4fuse.classroom.assignment.random_assignment import FlightKind
-    from px4fuse.report.page import Page
-    from px4fuse.simulation.flights import Simulation
 
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
-SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
 # Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
 # All options that can be combined with --assignment
@@ -207,7 +198,7 @@ def simulate(
         **{name: value for name, value in option_values.items() if value is not None},
     )
     from px4fuse.results.contract import to_json
-    from px4fuse.simulation import flights
+    from px4fuse.simulation import flights, terminal
 
     with progress() as show_progress:
         show_progress("simulating")
@@ -216,7 +207,7 @@ def simulate(
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
-    write_and_print(contents, _simulation_page(simulation, answer))
+    write_and_print(contents, terminal.summary(simulation, answer))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -265,14 +256,10 @@ def _write_assignment(
 ) -> None:
     """Write one flight per student and the answer key."""
     from px4fuse.classroom.assignment import assignment
-    from px4fuse.classroom.assignment.random_assignment import (
-        EASIEST_DIFFICULTY,
-        HARDEST_DIFFICULTY,
-    )
     from px4fuse.classroom.assignment.roster import read_roster
-    from px4fuse.report.page import Page
+    from px4fuse.classroom.terminal import assignment_page
 
-    students, page = read_roster(roster), Page()
+    students = read_roster(roster)
     key_file = assignment.key_path(folder, answer_path)
     check_targets([key_file])
     check_output_folder(folder)
@@ -281,61 +268,5 @@ def _write_assignment(
         key, written_files = assignment.assign(
             students, folder, key_file, secret, kind, count, truth, show_flight
         )
-    counts = Counter(
-        mistake.partition("=")[0]
-        for answer in key.answers
-        for mistake in answer.mistakes or ("none",)
-    )
-    difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
-    folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
-    flight_count = len(key.answers)
-    texts = {
-        "Class": f"{flight_count} student{'s' * (flight_count != 1)}, {kind}",
-        "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-        "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
-        "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
-        "Flights": f"{folder_text} ({written_files} logs written, {flight_count - written_files} "
-        "existed already)",
-        "Answers": f"{key_text} (not for students: the file lists the injected faults)",
-    }
-    if key.secret:
-        texts["Secret"] = (
-            "a new secret is stored in the answer key. Use --secret-file to write the same "
-            "flights again, or to add students."
-        )
-    page.write_labelled_texts(texts)
+    page = assignment_page(key, kind, folder, key_file, written_files)
     write_and_print({}, page)
-
-
-def _simulation_page(simulation: Simulation, answer: Path | None) -> Page:
-    from px4fuse.report.page import Page
-
-    scenario, page = simulation.scenario, Page()
-    has_several = scenario.passes > 1
-    path = f"{scenario.passes} lap{'s' * has_several} of a square of {scenario.length_m:g} m"
-    if scenario.kind == "aisle":
-        path = f"{scenario.passes} pass{'es' * has_several} of {scenario.length_m:g} m"
-    texts = {
-        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-        "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
-        f"{scenario.source_rate_hz:g} Hz",
-    }
-    if scenario.kind == "loop":
-        texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the path"
-    texts["IMU"] = f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
-    page.write_labelled_texts(texts)
-    mistake_texts = [
-        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}"
-        for name in active_mistake_names(simulation.mistakes)
-    ]
-    page.write_labelled("Faults", *(mistake_texts or ["none"]))
-    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    ekf2_text = "EKF2 is not simulated (--no-ekf2)"
-    if scenario.ekf2:
-        ekf2_text = "EKF2 data are from px4fuse's model of EKF2"
-    page.write_labelled("EKF2", ekf2_text)
-    if answer is not None:
-        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
-    return page
