@@ -12,11 +12,11 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
 from px4fuse.core.notebook_display import display_html
 from px4fuse.core.writing import write_all
-from px4fuse.diagnose import diagnose, run_what_if
+from px4fuse.diagnose import diagnose, require_available, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import MissingDataError, OutputError, SettingsError
+from px4fuse.errors import OutputError, SettingsError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
@@ -333,12 +333,7 @@ def what_if(
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
+    model = require_available(open_model(flight), flight)
     changes = {} if changes is None else changes
     settings = [changes] if isinstance(changes, Mapping) else changes
-    replays = whatif.what_if(model, settings, without)
-    if isinstance(replays, Unavailable):
-        raise MissingDataError(f"{replays.what}: {replays.reason}", replays.remedy)
-    return replays
+    return require_available(whatif.what_if(model, settings, without), flight)

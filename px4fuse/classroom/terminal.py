@@ -4,21 +4,15 @@ from collections import Counter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.random_assignment import (
-    EASIEST_DIFFICULTY,
-    HARDEST_DIFFICULTY,
-    FlightKind,
-)
+from px4fuse.classroom.assignment.random_assignment import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
 from px4fuse.classroom.grading.grade import GradeOutcome
-from px4fuse.core.text import one_line
+from px4fuse.core.text import count_noun, one_line
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 
-def assignment_page(
-    key: AnswerKey, kind: FlightKind, folder: Path, key_file: Path, written_count: int
-) -> Page:
+def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count: int) -> Page:
     """Format the faults and difficulties of the flights, and the written files."""
     counts = Counter(
         mistake.partition("=")[0]
@@ -29,7 +23,7 @@ def assignment_page(
     folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
     flight_count = len(key.answers)
     texts = {
-        "Class": f"{flight_count} student{'s' * (flight_count != 1)}, {kind}",
+        "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
         "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
         "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
         f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
@@ -127,20 +127,12 @@ def grade(
     rubric: Path | None,
     key: Path | None,
     output: Path | None,
-    title: str | None,
     roster: Path | None,
-    attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
-    grace: float,
-    scale: float | None,
-    questions: int | None,
-    include_pending: bool,
-    worksheet: tuple[Path, ...],
-    column: str | None,
-    anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
+    **option_values: Any,
 ) -> None:
     """Verify and grade the reports of a class.
 
@@ -160,33 +152,29 @@ def grade(
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    late_deduction = parse_late_rule(late) if late else None
-    if late_deduction is not None and due is None:
+    if late and due is None:
         raise SettingsError("--late requires --due TIME.")
-    if questions and key is None:
+    question_count = option_values.pop("questions") or 0
+    if question_count and key is None:
         raise SettingsError("--questions requires --key FILE.json.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("px4fuse grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
-    answer_key = None if key is None else read_key(key)
     course = Course(
         read_rubric(rubric),
-        answer_key,
+        None if key is None else read_key(key),
         logs,
-        title or "",
+        option_values.pop("title") or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
-        worksheets=tuple(map(read_sheet, worksheet)),
-        column=column or "",
-        attempt=attempt,
+        worksheets=tuple(map(read_sheet, option_values.pop("worksheet"))),
+        column=option_values.pop("column") or "",
         due=parse_due_time(due) if due else None,
-        late_rule=late_deduction,
-        grace_s=60.0 * grace,
-        scale=scale,
-        question_count=questions or 0,
-        include_pending=include_pending,
-        anonymous=anonymous,
+        late_rule=parse_late_rule(late) if late else None,
+        grace_s=60.0 * option_values.pop("grace"),
+        question_count=question_count,
+        **option_values,
     )
     try:
         with progress() as show_progress:

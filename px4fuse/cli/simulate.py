@@ -1,11 +1,9 @@
 """Command ``px4fuse simulate``: simulates flights with ground truth and injected faults."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args
+from typing import Any, get_args
 
 import click
 
@@ -31,9 +29,6 @@ from px4fuse.simulation.scenario import (
     make_scenario,
 )
 
-if TYPE_CHECKING:
-    from px4fuse.classroom.assignment.random_assignment import FlightKind
-
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
@@ -49,18 +44,15 @@ ASSIGNMENT_OPTIONS = (
     *ASSIGNMENT_ONLY_OPTIONS,
 )
 MAX_SECRET_BYTES = 10_000
-Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def _scenario_options(command: Command) -> Command:
+def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add an option for each number of a scenario, with default and help of the field."""
     for field, quantity in reversed(bounds_by_field(Scenario).items()):
         if not quantity.meaning:
             continue
-        default, outdoors = (
-            getattr(_DEFAULT_SCENARIO, field),
-            DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field),
-        )
+        default = getattr(_DEFAULT_SCENARIO, field)
+        outdoors = DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field)
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
@@ -162,7 +154,7 @@ def simulate(
     answer: Path | None,
     no_truth: bool,
     no_ekf2: bool,
-    kind: Literal[ScenarioKind, "mixed"],
+    kind: Any,
     seed: int,
     passes: int | None,
     yaw: YawMode | None,
@@ -181,8 +173,8 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        random_choices = _read_secret(secret_file), cast("FlightKind", kind), mistakes
-        _write_assignment(assignment, output, answer, *random_choices, truth=not no_truth)
+        secret = _read_secret(secret_file)
+        _write_assignment(assignment, output, answer, secret, kind, mistakes, not no_truth)
         return
     if kind == MIXED_KIND:
         raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
@@ -192,7 +184,7 @@ def simulate(
     mistake_sizes = parse_mistakes(mistake)
     option_values |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = make_scenario(
-        cast(ScenarioKind, kind),
+        kind,
         truth=not no_truth,
         ekf2=not no_ekf2,
         **{name: value for name, value in option_values.items() if value is not None},
@@ -249,9 +241,8 @@ def _write_assignment(
     folder: Path,
     answer_path: Path | None,
     secret: bytes | None,
-    kind: FlightKind,
+    kind: Any,
     count: int | None,
-    *,
     truth: bool,
 ) -> None:
     """Write one flight per student and the answer key."""
@@ -268,5 +259,4 @@ def _write_assignment(
         key, written_files = assignment.assign(
             students, folder, key_file, secret, kind, count, truth, show_flight
         )
-    page = assignment_page(key, kind, folder, key_file, written_files)
-    write_and_print({}, page)
+    write_and_print({}, assignment_page(key, folder, key_file, written_files))
