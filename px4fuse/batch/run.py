@@ -1,6 +1,5 @@
 """Run of ``px4fuse batch``: compares logs in worker processes, and writes the table."""
 
-import io
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -313,10 +312,8 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
-    parquet = io.BytesIO()
-    table.to_parquet(parquet, index=False)
     contents = {
-        state.output / "fleet.parquet": parquet.getvalue(),
+        state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": csv_bytes(table),
         state.output / "fleet.html": page.encode(),
     }

@@ -14,7 +14,7 @@ from px4fuse.request import settings_name
 
 
 @click.command()
-@click.argument("log", type=options.InputPath())
+@options.log_argument
 @options.analysis_options
 @options.student_options
 @options.report_options(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,9 @@ import click
 
 from px4fuse.cli.options import (
     Choice,
-    InputPath,
     comparison_request,
     flight_options,
+    log_argument,
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
@@ -30,7 +29,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
-@click.argument("log", type=InputPath())
+@log_argument
 @output_option("DIR", "Output folder for the tables.", required=True)
 @click.option(
     "--format",
@@ -63,8 +62,12 @@ def extract(
     flight = extraction.with_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
-    encode = _parquet_bytes if format == "parquet" else _csv_bytes
-    contents = {output / f"{name}.{format}": encode(table) for name, table in tables.items()}
+    contents = {
+        output / f"{name}.{format}": table.to_parquet(engine="pyarrow", index=False)
+        if format == "parquet"
+        else _csv_bytes(table)
+        for name, table in tables.items()
+    }
     contents[output / "data_dictionary.csv"] = _csv_bytes(extraction.data_dictionary(flight))
     contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
@@ -81,12 +84,11 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
         with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
-        is_other_log = earlier_log["sha256"] != sha256
-        name = str(earlier_log["name"])
+        name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
     # the file does not exist, or is not a flight.json of px4fuse
     except (OutputError, ValueError, KeyError, TypeError):
         return
-    if is_other_log:
+    if earlier_sha256 != sha256:
         raise OutputError(
             f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
         )
@@ -95,9 +97,3 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
 def _csv_bytes(table: pd.DataFrame) -> bytes:
     # pandas writes enough digits to read the same float64 again
     return table.to_csv(index=False, lineterminator="\n").encode()
-
-
-def _parquet_bytes(table: pd.DataFrame) -> bytes:
-    buffer = io.BytesIO()
-    table.to_parquet(buffer, engine="pyarrow", index=False)
-    return buffer.getvalue()

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import InputPath, comparison_request, flight_options, json_option
-from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
+from px4fuse.cli.options import comparison_request, flight_options, json_option, log_argument
+from px4fuse.cli.outputs import progress, result_files, write_and_print
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
@@ -24,7 +24,7 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
 
 
 @click.command()
-@click.argument("log", type=InputPath())
+@log_argument
 @click.option(
     "--versions",
     is_flag=True,
@@ -46,7 +46,6 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.report.inventory import summary
 
     request = comparison_request(log, option_values)
-    check_targets([json_path])
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         show_progress("reading the contents of the log")

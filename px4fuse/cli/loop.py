@@ -242,8 +242,7 @@ def _solve_graph(
                 f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
-    outputs.check_targets([json_path, g2o])
-    with outputs.progress(json_path) as show_progress:
+    with outputs.progress(json_path, g2o) as show_progress:
         show_progress(f"reading {display_name(source)}")
         results, solved_graph = analyse_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust

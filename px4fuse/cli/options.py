@@ -125,6 +125,7 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
+log_argument = click.argument("log", type=InputPath())
 #: Option --timeout of commands that analyse logs in worker processes
 timeout_option = click.option(
     "--timeout",

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -48,6 +48,11 @@ OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
+# Function that receives the current activity of a run and, if known, the counts of finished and all
+# items
+ShowProgress = Callable[..., None]
+
+
 class Interrupted(Exception):  # noqa: N818 - no error, because the user ends the run
     """End of a run by Ctrl-C or a termination signal, with a sentence on the written files."""
 
@@ -57,24 +62,18 @@ class Interrupted(Exception):  # noqa: N818 - no error, because the user ends th
         self.exit_code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-class ShowProgress(Protocol):
-    """Function that shows the current activity of a run, and the count of finished items."""
-
-    def __call__(
-        self, activity: str, done_count: int = 0, total_count: int | None = None
-    ) -> None: ...
-
-
-def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-    """Ignore the progress of a run."""
-
-
 @contextmanager
-def progress(output: Path | None = None) -> Iterator[ShowProgress]:
-    """Provide a function that shows the progress on a terminal.
+def progress(*targets: Path | None) -> Iterator[ShowProgress]:
+    """Check the output paths, and provide a function that shows the progress on a terminal.
 
-    In a pipe, or if ``output`` is standard output, the function shows nothing.
+    In a pipe, or if a target is standard output, the function shows nothing.
+
+    Raises
+    ------
+    OutputError
+        A target is not possible, see :func:`check_targets`.
     """
+    check_targets(targets)
     context = click.get_current_context(silent=True)
     if context and (send := context.meta.get(SEND_KEY)):
         yield lambda activity, *_: send(activity)
@@ -83,8 +82,8 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
     console = Console(stderr=True)
     # even a disabled progress bar prints an empty line in older versions of rich
-    if not console.is_terminal or output == STANDARD_OUTPUT:
-        yield show_nothing
+    if not console.is_terminal or STANDARD_OUTPUT in targets:
+        yield lambda *_: None
         return
     from rich import progress as rich_progress
 
@@ -213,7 +212,7 @@ def result_files(
     json_path: Path | None,
     output: Path | None = None,
     analysis: object = None,
-    show_progress: ShowProgress = show_nothing,
+    show_progress: ShowProgress = lambda *_: None,
     default_name: str = "",
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by their paths.

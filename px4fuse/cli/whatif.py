@@ -12,7 +12,7 @@ from px4fuse.request import Sweep, WhatIfRequest
 
 
 @click.command()
-@click.argument("log", type=options.InputPath())
+@options.log_argument
 @click.option(
     "--set",
     "changes",
@@ -67,7 +67,6 @@ def whatif(
     from px4fuse.report.whatif import summary
     from px4fuse.results.build import whatif_results
 
-    outputs.check_targets([json_path])
     if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(

@@ -304,7 +304,9 @@ def _list_options(
     results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rates = (
-            f"{aid.label} {_rate_text(ekf2.aids[name].samples)}"
+            f"{aid.label} {sample_rate(samples):.2g} Hz"
+            if len(samples := ekf2.aids[name].samples) > 1
+            else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
         description = ", ".join(rates)
@@ -314,10 +316,6 @@ def _list_options(
         replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay of {replayed_s:.0f} s with {inputs.aid.label}"
     yield _make_option("what-if", inputs, description)
-
-
-def _rate_text(samples: pd.DataFrame) -> str:
-    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
 def _make_option(name: str, data: object, description: str) -> AnalysisOption:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from px4fuse.core.text import count_noun
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.simulation.flights import Simulation
@@ -13,10 +14,10 @@ SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", "outdoor": "GNSS"}
 def summary(simulation: Simulation, answer: Path | None) -> Page:
     """Format the simulated flight with its injected faults."""
     scenario, page = simulation.scenario, Page()
-    has_several = scenario.passes > 1
-    path = f"{scenario.passes} lap{'s' * has_several} of a square of {scenario.length_m:g} m"
+    path = f"{count_noun(scenario.passes, 'lap')} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
-        path = f"{scenario.passes} pass{'es' * has_several} of {scenario.length_m:g} m"
+        plural = "es" * (scenario.passes > 1)
+        path = f"{scenario.passes} pass{plural} of {scenario.length_m:g} m"
     texts = {
         "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
         f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
@@ -32,11 +33,13 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
         for name in active_mistake_names(simulation.mistakes)
     ]
     page.write_labelled("Faults", *(mistake_texts or ["none"]))
-    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    ekf2_text = "EKF2 is not simulated (--no-ekf2)"
-    if scenario.ekf2:
-        ekf2_text = "EKF2 data are from px4fuse's model of EKF2"
-    page.write_labelled("EKF2", ekf2_text)
+    texts = {
+        "Truth": "logged" if scenario.truth else "not logged",
+        "EKF2": "EKF2 data are from px4fuse's model of EKF2"
+        if scenario.ekf2
+        else "EKF2 is not simulated (--no-ekf2)",
+    }
     if answer is not None:
-        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
+        texts["Answer"] = f"{to_one_line(str(answer))} (not for students)"
+    page.write_labelled_texts(texts)
     return page
