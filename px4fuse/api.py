@@ -28,21 +28,21 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() with their data types
-COLUMNS = {
-    "count": "Int64",
-    "nis_mean": "float64",
-    "nis_low": "float64",
-    "nis_high": "float64",
-    "verdict": "object",
-    "sigma_ratio": "float64",
-    "innovation_std_m": "float64",
-    "sqrt_s_median_m": "float64",
-    "sigma_p_median_m": "float64",
-    "position_rmse_m": "float64",
-    "velocity_rmse_m_s": "float64",
-    "nees_position_mean": "float64",
-}
+# Columns of table(); they contain floats, except for "count" and "verdict"
+COLUMNS = (
+    "count",
+    "nis_mean",
+    "nis_low",
+    "nis_high",
+    "verdict",
+    "sigma_ratio",
+    "innovation_std_m",
+    "sqrt_s_median_m",
+    "sigma_p_median_m",
+    "position_rmse_m",
+    "velocity_rmse_m_s",
+    "nees_position_mean",
+)
 
 
 def compare(
@@ -145,7 +145,8 @@ def table(analysis: Analysis) -> pd.DataFrame:
         for filter_name, summary in axis.filters.items()
     }
     index = pd.MultiIndex.from_tuples(rows, names=["axis", "filter"])
-    return pd.DataFrame(list(rows.values()), index, list(COLUMNS)).astype(COLUMNS)
+    types = dict.fromkeys(COLUMNS, "float64") | {"count": "Int64", "verdict": "object"}
+    return pd.DataFrame(list(rows.values()), index, COLUMNS).astype(types)
 
 
 def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:

@@ -233,6 +233,8 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
+# Unit of the numbers in a field, by the end of its name
+SUFFIX_UNITS = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 _POSITION_OPTIONS = {
     "path": "--position",
     "body": "--body",
@@ -252,7 +254,7 @@ def _option_names(
     An option is the field name with hyphens and without unit, except for ``renamed_options``.
     """
     option_names = {
-        field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
+        field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(request_type)
         if not field.required and field.name not in excluded
     }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +14,6 @@ from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.request import (
-    FrameName,
     GivenClosure,
     Landing,
     LoopRequest,
@@ -56,6 +56,9 @@ def parse_closure(text: str) -> GivenClosure:
     )
 
 
+_loop_option = partial(options.request_option, LoopRequest)
+
+
 @click.command()
 @click.argument("source", type=options.InputPath())
 @click.option(
@@ -88,19 +91,17 @@ def parse_closure(text: str) -> GivenClosure:
     help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
     "which takes minutes.",
 )
-@click.option(
-    "--from",
+@_loop_option(
     "start_s",
-    type=options.TypedQuantity("s", 20.0),
-    help="Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
     "[default: take-off]",
+    20.0,
 )
-@click.option(
-    "--to",
+@_loop_option(
     "end_s",
-    type=options.TypedQuantity("s", 60.0),
-    help="End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
     "[default: landing]",
+    60.0,
 )
 @click.option(
     "--reference",
@@ -109,31 +110,23 @@ def parse_closure(text: str) -> GivenClosure:
     help="Reference trajectory (for example from SLAM) for the ATE and RPE of each path, in "
     "addition to the ground truth of the log.",
 )
-@click.option(
-    "--drift",
+@_loop_option(
     "position_drift_m",
-    type=options.TypedQuantity("m", 1.0),
-    default=1.0,
-    help="Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
-@click.option(
-    "--heading-drift",
+@_loop_option(
     "heading_drift_deg",
-    type=options.TypedQuantity("°", 3.0),
-    default=3.0,
-    help="Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
-@click.option(
-    "--key-frames",
+@_loop_option(
     "key_frames_m",
-    type=options.TypedQuantity("m", 0.2),
-    help="Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
+    "Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
     "the path, 0.02 to 0.5 m]",
+    0.2,
 )
-@click.option(
-    "--frame",
-    type=options.Choice(get_args(FrameName)),
-    help="Coordinate frame of a trajectory file.  [default: detected]",
+@_loop_option(
+    "frame",
+    "Coordinate frame of a trajectory file.  [default: detected]",
 )
 @options.system_option
 @options.max_size_option
