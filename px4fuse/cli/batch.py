@@ -18,12 +18,12 @@ FAIL_LEVELS = ("failed", *SEVERITIES)
 @options.output_option(
     "DIR", "Output folder for the table and the results of each log.", required=True
 )
-@click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
+@options.flag("--reports", help="Also write a PDF report for each log.")
 @options.timeout_option
-@click.option(
+@options.count_option(
     "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
+    1,
+    1024,
     help="Number of logs that this computer processes in parallel.  [default: number of cores]",
 )
 @options.memory_option

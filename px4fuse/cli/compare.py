@@ -21,19 +21,17 @@ from px4fuse.request import settings_name
     "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )
 @options.fail_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
-@click.option(
+@options.flag(
     "--checks",
-    is_flag=True,
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
     "long time.",
 )
-@click.option(
+@options.flag(
     "-v",
     "--verbose",
-    is_flag=True,
     help="Print all findings, axes and KF settings on the terminal.",
 )
-@click.option("-q", "--quiet", is_flag=True, help="Print the diagnosis on one line only.")
+@options.flag("-q", "--quiet", help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
     log: Path,

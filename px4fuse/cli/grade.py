@@ -10,6 +10,8 @@ from px4fuse.cli.options import (
     Choice,
     InputPath,
     NonEmptyPath,
+    count_option,
+    flag,
     input_option,
     max_size_option,
     open_option,
@@ -80,16 +82,15 @@ from px4fuse.errors import OutputError, SettingsError
     help="Maximum points on the learning platform, to which the grades in --worksheet are scaled.  "
     "[default: the points of the rubric]",
 )
-@click.option(
+@count_option(
     "--questions",
-    type=click.IntRange(1, 10),
-    metavar="N",
+    1,
+    10,
     help="Write questions.txt: N questions to each student for an oral check, from the student's "
     "own form and flight, with the expected answers. Requires --key.",
 )
-@click.option(
+@flag(
     "--include-pending",
-    is_flag=True,
     help="Count points that the instructor has not confirmed yet.",
 )
 @input_option(
@@ -102,15 +103,14 @@ from px4fuse.errors import OutputError, SettingsError
 @click.option(
     "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."
 )
-@click.option(
+@flag(
     "--anonymous",
-    is_flag=True,
     help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
 )
-@click.option(
+@count_option(
     "--jobs",
-    type=click.IntRange(1, 256),
-    metavar="N",
+    1,
+    256,
     help="Number of reports that are processed in parallel.  [default: number of cores]",
 )
 @click.option(

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import comparison_request, flight_options, json_option, log_argument
+from px4fuse.cli.options import comparison_request, flag, flight_options, json_option, log_argument
 from px4fuse.cli.outputs import progress, result_files, write_and_print
 
 
@@ -25,9 +25,8 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
 
 @click.command()
 @log_argument
-@click.option(
+@flag(
     "--versions",
-    is_flag=True,
     is_eager=True,
     expose_value=False,
     callback=_print_versions,

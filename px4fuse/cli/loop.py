@@ -69,10 +69,9 @@ _loop_option = partial(options.request_option, LoopRequest)
     "nose at take-off) and to the right (m), and the clockwise rotation (°) if known.  [default: "
     "the ground truth of the log, else 0,0]",
 )
-@click.option(
+@options.flag(
     "--open",
     "opened",
-    is_flag=True,
     help="Do not use the landing as a loop closure, because the vehicle did not return to the "
     "take-off place.",
 )
@@ -85,9 +84,8 @@ _loop_option = partial(options.request_option, LoopRequest)
     help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s), within SIGMA "
     "(m, 1 σ); repeatable.  [default SIGMA: 0.1 m]",
 )
-@click.option(
+@options.flag(
     "--robust",
-    is_flag=True,
     help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
     "which takes minutes.",
 )

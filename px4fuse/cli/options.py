@@ -165,6 +165,13 @@ def _json_option(more_text: str = "") -> Option:
 json_option = _json_option()
 
 
+flag = partial(click.option, is_flag=True)
+
+
+def count_option(name: str, low: int, high: int, **details: Any) -> Option:
+    return click.option(name, type=click.IntRange(low, high), metavar="N", **details)
+
+
 def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
     return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
 
@@ -193,9 +200,8 @@ def exit_for_severity(fail_on: str | None, levels: Sequence[str], reached: Itera
 
 
 def _open_flag(*names: str) -> Option:
-    return click.option(
+    return flag(
         *names,
-        is_flag=True,
         expose_value=False,
         callback=lambda ctx, _, value: ctx.meta.update({OPENS_OUTPUT_KEY: value}),
         help="Open the written report or page in its default program.",

@@ -11,6 +11,7 @@ from px4fuse.cli.options import (
     Choice,
     NonEmptyPath,
     TypedQuantity,
+    flag,
     input_option,
     output_option,
     typed_parameters,
@@ -128,8 +129,8 @@ class CommandWithFaultTable(click.Command):
     help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
     "students.  [default with --assignment: DIR_answers.json]",
 )
-@click.option("--no-truth", is_flag=True, help="Write no ground truth to the log.")
-@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2, to save time.")
+@flag("--no-truth", help="Write no ground truth to the log.")
+@flag("--no-ekf2", help="Do not simulate EKF2, to save time.")
 @click.option(
     "--passes",
     type=int,
@@ -155,9 +156,6 @@ def simulate(
     no_truth: bool,
     no_ekf2: bool,
     kind: Any,
-    seed: int,
-    passes: int | None,
-    yaw: YawMode | None,
     **option_values: Any,
 ) -> None:
     """Simulate a flight with ground truth and injected faults.
@@ -182,7 +180,6 @@ def simulate(
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
     mistake_sizes = parse_mistakes(mistake)
-    option_values |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = make_scenario(
         kind,
         truth=not no_truth,
