@@ -31,7 +31,26 @@ FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
-class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+# Fields of requests that contain a path
+_PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
+
+
+class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base class of all requests and of the position file."""
+
+    def without_paths(self) -> Self:
+        """Return the request with file names instead of paths, as the results contain it."""
+        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
+        changes: dict[str, Any] = {
+            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
+        }
+        position = getattr(self, "position", None)
+        if position is not None:
+            changes["position"] = position.without_paths()
+        return msgspec.structs.replace(self, **changes)
+
+
+class PositionFile(_BaseRequest, frozen=True, kw_only=True):
     """Recording of the positioning system, with its frame, columns and units.
 
     Attributes
@@ -58,25 +77,6 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     columns: tuple[str, ...] | None = None
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     length_unit: Literal["m", "cm", "mm"] | None = None
-
-
-# Fields of requests that contain a path
-_PATH_FIELDS = ("log", "source", "estimate", "reference")
-
-
-class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of all requests."""
-
-    def without_paths(self) -> Self:
-        """Return the request with file names instead of paths, as the results contain it."""
-        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
-        changes: dict[str, Any] = {
-            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
-        }
-        position = getattr(self, "position", None)
-        if position is not None:
-            changes["position"] = msgspec.structs.replace(position, path=_file_name(position.path))
-        return msgspec.structs.replace(self, **changes)
 
 
 class ComparisonRequest(

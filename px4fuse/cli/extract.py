@@ -1,11 +1,9 @@
 """Command ``px4fuse extract``: exports a log as tables."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -20,9 +18,6 @@ from px4fuse.cli.outputs import write_outputs
 from px4fuse.core.input_files import check_output_folder, inputs_not_registered
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Maximum size (bytes) of flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
@@ -63,12 +58,12 @@ def extract(
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
     contents = {
-        output / f"{name}.{format}": table.to_parquet(engine="pyarrow", index=False)
-        if format == "parquet"
-        else _csv_bytes(table)
+        output / f"{name}.{format}": extraction.to_bytes(table, format)
         for name, table in tables.items()
     }
-    contents[output / "data_dictionary.csv"] = _csv_bytes(extraction.data_dictionary(flight))
+    contents[output / "data_dictionary.csv"] = extraction.to_bytes(
+        extraction.data_dictionary(flight), "csv"
+    )
     contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
@@ -92,8 +87,3 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
         raise OutputError(
             f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
         )
-
-
-def _csv_bytes(table: pd.DataFrame) -> bytes:
-    # pandas writes enough digits to read the same float64 again
-    return table.to_csv(index=False, lineterminator="\n").encode()

@@ -1,7 +1,7 @@
 """Contents of a log, possible analyses, and advice on logging for the next flight."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -191,7 +191,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     """Convert the inventory of a log to JSON types, without unknown values."""
-    inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
+    inventory_fields = {**vars(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
     if isinstance(flight.airborne, Unavailable):
