@@ -23,7 +23,7 @@ from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap, InputFile
+from px4fuse.flight.log import InputFile, clock_of_repeated_timestamps
 from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
@@ -32,8 +32,6 @@ from px4fuse.readers.position_file import PositionRecording
 # Maximum ratio of the second best to the best residual for a warning about an ambiguous time
 # offset, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
-# Maximum fraction of rows with distinct timestamps in a file whose timestamps are too coarse
-MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
@@ -117,7 +115,10 @@ def align_position_file(
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    clock_map = _clock_with_shared_timestamps(recording)
+    sample_count = len(recording.samples)
+    clock_map = clock_of_repeated_timestamps(
+        recording.clock, sample_count + recording.dropped, sample_count
+    )
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -145,17 +146,6 @@ def align_position_file(
         log=structs.replace(flight.log, notes=(*flight.log.notes, *notes), dropped=dropped),
         positions=(track, *flight.positions),
         inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
-    )
-
-
-def _clock_with_shared_timestamps(recording: PositionRecording) -> ClockMap | None:
-    """Return the clock of a file in which most rows repeat a timestamp, else None."""
-    distinct_count = len(recording.samples)
-    row_count = distinct_count + recording.dropped
-    if distinct_count > MAX_DISTINCT_FRACTION * row_count:
-        return None
-    return ClockMap(
-        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
     )
 
 

@@ -79,6 +79,17 @@ class ClockMap(Record, frozen=True):
     distinct_stamps: Count | None = None
 
 
+def clock_of_repeated_timestamps(
+    clock: str, sample_count: int, distinct_count: int
+) -> ClockMap | None:
+    """Describe a clock of which most timestamps are repeated, else return None."""
+    if 2 * distinct_count > sample_count:
+        return None
+    return ClockMap(
+        clock, "as sent", sample_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
+    )
+
+
 @dataclass(frozen=True)
 class Stream:
     """Origin of one kind of data: topics or messages, clock of the timestamps, and file name."""
