@@ -69,6 +69,7 @@ NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dty
 class Columns:
     """Column names of all tables of a flight, with units."""
 
+    GEODETIC: Final = ["latitude_deg", "longitude_deg", "altitude_m"]
     POSITION: Final = ["north_m", "east_m", "down_m"]
     VELOCITY: Final = ["north_m_s", "east_m_s", "down_m_s"]
     STATE: Final = POSITION + VELOCITY

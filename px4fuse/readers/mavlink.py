@@ -175,7 +175,7 @@ def _read_ekf2(
             f"EKF2 reset its state {reset_count} times; the resets were not removed, because "
             "ODOMETRY does not contain the size of a reset"
         )
-    variance: TableOrUnavailable = samples.reindex(columns=VARIANCE_COLUMNS)
+    variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
         message_name = messages.LAYOUTS["accuracy"].topic
@@ -187,15 +187,14 @@ def _read_ekf2(
             )
     if len(variance):
         recording.record_stream("ekf2_variance", message_name)
-    else:
-        variance = Unavailable(
-            "EKF2 variances",
-            "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-            remedies["variance"],
-        )
+    no_variance = Unavailable(
+        "EKF2 variances",
+        "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+        remedies["variance"],
+    )
     return Ekf2(
         state=state,
-        variance=variance,
+        variance=variance if len(variance) else no_variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",

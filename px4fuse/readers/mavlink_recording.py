@@ -280,7 +280,7 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         f"{bad_bytes:,} bytes ({bad_bytes / byte_count:.2%}) are not part of a complete MAVLink "
         "frame"
     )
-    damage = ()
+    damage: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file do not count as damage
     if bad_bytes - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
         damage = (f"the file is damaged: {lost_text}",)

@@ -34,7 +34,6 @@ from px4fuse.readers.common import (
     read_orientation,
     rounding_step,
 )
-from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
@@ -339,10 +338,8 @@ def project(
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
-    latitude, longitude, latitude_0, longitude_0 = map(
-        np.radians, (latitude_deg, longitude_deg, *origin[:2])
-    )
-    difference = longitude - longitude_0
+    latitude_0, longitude_0 = np.radians(origin[:2])
+    latitude, difference = np.radians(latitude_deg), np.radians(longitude_deg) - longitude_0
     sine, cosine = np.sin(latitude), np.cos(latitude)
     sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
     cosine_difference = np.cos(difference)
@@ -388,9 +385,9 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
     latitude and longitude 0: these samples become NaN.
     """
-    global_positions = global_positions[GLOBAL_COLUMNS].mask(
-        (global_positions[GLOBAL_COLUMNS[:2]] == 0.0).all(axis=1)
-    )
+    global_positions = global_positions[Columns.GEODETIC]
+    is_missing = (global_positions.iloc[:, :2] == 0.0).all(axis=1)
+    global_positions = global_positions.mask(is_missing)
     latitude, longitude, altitude = global_positions.to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin)
@@ -498,7 +495,7 @@ def read_truth(
     local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
     logged_local = topics.read(local_layout)
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(global_layout), GLOBAL_COLUMNS[:2])
+    global_positions = finite_rows(topics.read(global_layout), Columns.GEODETIC[:2])
     if len(global_positions):
         projected = project_to_ned(global_positions, _local_origin(topics))
         if local_samples.empty:

@@ -26,9 +26,12 @@ LEVER_ARM_ITERATIONS = 5
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the orientation of a trajectory that moves without rotating; return also a note."""
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
-    if rotation is None or len(trajectory) < MIN_CONSTANT_POSES or extent_m < MIN_CONSTANT_MOTION_M:
-        return trajectory, ()
-    if (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD:
+    if (
+        rotation is None
+        or len(trajectory) < MIN_CONSTANT_POSES
+        or extent_m < MIN_CONSTANT_MOTION_M
+        or (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD
+    ):
         return trajectory, ()
     return replace(trajectory, rotation=None), (
         f"{trajectory.name} has no orientation (constant quaternion). Rotations are not scored.",
@@ -45,13 +48,11 @@ def find_frozen_poses(
         start_s, end_s = estimate.time_s[[start, end - 1]].tolist()
         if end_s - start_s < MIN_FROZEN_S:
             continue
-        is_at_same_time = (reference.time_s >= start_s + time_offset_s) & (
-            reference.time_s <= end_s + time_offset_s
-        )
-        if not is_at_same_time.any():
-            continue
-        motion_m = float(np.linalg.norm(np.ptp(reference.position_m[is_at_same_time], axis=0)))
-        if motion_m > MIN_FROZEN_MOTION_M:
+        motion = reference.between(start_s + time_offset_s, end_s + time_offset_s).position_m
+        if (
+            len(motion)
+            and (motion_m := np.linalg.norm(np.ptp(motion, axis=0))) > MIN_FROZEN_MOTION_M
+        ):
             is_frozen[start + 1 : end] = True
             warnings.append(
                 f"The position of {estimate.name} does not change from "
