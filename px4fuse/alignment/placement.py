@@ -78,14 +78,13 @@ def align_position_file(
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
-    boot_s = flight.log.boot_time_s
+    boot_s, duration_s = flight.log.boot_time_s, flight.log.duration_s
     spans_text = (
-        f"the log is from {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot "
-        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} "
-        "clock"
+        f"the log is from {boot_s:.2f} s to {boot_s + duration_s:.2f} s on the boot clock, the "
+        f"position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
-    if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
+    if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
             f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
@@ -102,20 +101,20 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
-    yaw_reason = "the yaw was given with --position-yaw"
-    if yaw_deg is None:
-        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
     frame_reason = "the column names of the position file show the frame"
     if recording.format:
         frame_reason = f"files of the format {recording.format} have this frame"
     if frame:
         frame_reason = "the frame was given with --position-frame"
+    yaw_reason = "the yaw was given with --position-yaw"
+    if yaw_deg is None:
+        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
     alignment, aligned_samples = _describe_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    sample_count = len(recording.samples)
+    invalid, sample_count = recording.invalid, len(recording.samples)
     clock_map = clock_of_repeated_timestamps(
         recording.clock, sample_count + recording.dropped, sample_count
     )
@@ -132,18 +131,15 @@ def align_position_file(
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid=recording.invalid.set_axis(
-            recording.invalid.index + (aligned_samples.index[0] - start_s)
-        ),
+        invalid=invalid.set_axis(invalid.index + (aligned_samples.index[0] - start_s)),
         step_m=recording.step_m,
     )
     notes = [f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)]
-    dropped = dict(flight.log.dropped)
-    if recording.dropped and not clock_map:
-        dropped[recording.name] = recording.dropped
+    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+    log = flight.log
     return replace(
         flight,
-        log=structs.replace(flight.log, notes=(*flight.log.notes, *notes), dropped=dropped),
+        log=structs.replace(log, notes=(*log.notes, *notes), dropped={**log.dropped, **dropped}),
         positions=(track, *flight.positions),
         inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
     )
@@ -153,10 +149,8 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame not in (None, *tracks.FRAMES):
-        raise SettingsError(
-            f"`frame` {frame} is not a known coordinate frame.",
-            f"Use one of {', '.join(tracks.FRAMES)}.",
-        )
+        remedy = f"Use one of {', '.join(tracks.FRAMES)}."
+        raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
@@ -213,8 +207,9 @@ def _describe_alignment(
         reference = EKF2_POSITION
         distance_m, correlation = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_m**2) / 2.0))
-    frame_conflict = "" if is_yaw_free else _describe_frame_conflict(match, distance_m, yaw_rad)
-    warnings = [*_find_warnings(match, is_yaw_free)]
+    frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_free)] if match else []
+    if match and not is_yaw_free:
+        frame_conflict = _describe_frame_conflict(match, distance_m, yaw_rad)
     if (
         ekf2_comparison
         and not (is_yaw_free or frame_conflict)
@@ -259,27 +254,24 @@ def _compare_with_ekf2(
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2_position_m, is_known = tracks.ekf2_track_without_resets(
-            flight.ekf2, aligned_samples
-        ).at(aligned_samples.index.to_numpy())
+        ekf2_track = tracks.ekf2_track_without_resets(flight.ekf2, aligned_samples)
     except NoMatchError:
         return None
+    ekf2_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
     if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
     file_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
-    ekf2_m = ekf2_position_m[is_known, :2]
+    ekf2_m = ekf2_m[is_known, :2]
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
-    norm_product = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    norm_product = np.linalg.norm(file_m) * np.linalg.norm(ekf2_m)
     if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m)) / norm_product
+    return distance_m, float(np.sum(file_m * ekf2_m) / norm_product)
 
 
-def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
-    if match is None:
-        return ""
+def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
     fit = match.free_yaw_fit
     is_rotated = match.is_rotated
@@ -303,9 +295,7 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     )
 
 
-def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:
-    if match is None:
-        return
+def _find_warnings(match: Match, is_yaw_free: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance < matching.MIN_GOOD_CONCORDANCE[reference_name]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABCMeta
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union, dataclass_transform
 
 import msgspec
 from msgspec import Meta
@@ -29,6 +29,7 @@ Vector = tuple[float, float, float]
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
+@dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Immutable record; fields that are None are not written to the results.
 
@@ -39,7 +40,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     __repr__ = one_line_repr
 
 
-class Unavailable(Record, frozen=True):
+class Unavailable(Record):
     """Missing data with reason and action, used in place of a record.
 
     Attributes
@@ -126,7 +127,7 @@ def to_serializable(value: Any) -> Any:
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
-def read_toml(module_file: str, name: str, kind: type[T]) -> T:
+def read_toml(module_file: str, kind: type[T], name: str = "") -> T:
     """Read a TOML file of px4fuse as the type ``kind``.
 
     Parameters
@@ -134,6 +135,7 @@ def read_toml(module_file: str, name: str, kind: type[T]) -> T:
     module_file : str
         ``__file__`` of a module in the same folder.
     name : str
-        Name of the TOML file.
+        Name of the TOML file; by default that of the module.
     """
-    return msgspec.toml.decode(Path(module_file).with_name(name).read_bytes(), type=kind)
+    path = Path(module_file).with_suffix(".toml")
+    return msgspec.toml.decode((path.with_name(name) if name else path).read_bytes(), type=kind)

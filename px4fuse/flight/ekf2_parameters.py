@@ -96,7 +96,7 @@ class Parameter(NamedTuple):
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-PARAMETER_TABLES = read_toml(__file__, "ekf2_parameters.toml", dict)
+PARAMETER_TABLES = read_toml(__file__, dict)
 # Keys of PARAMETER_TABLES whose text contains several names, separated by blanks
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, DISTURBANCES = (

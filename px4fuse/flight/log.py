@@ -21,14 +21,14 @@ DIAGNOSIS_WITHHELD = Unavailable(
 )
 
 
-class Dropout(Record, frozen=True):
+class Dropout(Record):
     """Time span (s) in which the logger of the autopilot lost data."""
 
     start_s: float
     duration_s: NotNegative
 
 
-class Sender(Record, frozen=True):
+class Sender(Record):
     """Sender of messages in a MAVLink recording.
 
     Attributes
@@ -54,7 +54,7 @@ class Sender(Record, frozen=True):
     chosen: bool
 
 
-class ClockMap(Record, frozen=True):
+class ClockMap(Record):
     """Linear conversion of a clock to the autopilot's boot clock.
 
     boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
@@ -108,7 +108,7 @@ class UnusedData:
     reason: str
 
 
-class InputFile(Record, frozen=True):
+class InputFile(Record):
     """Input file in addition to the log: name without folder, SHA-256, size (bytes) and role."""
 
     name: str
@@ -117,7 +117,7 @@ class InputFile(Record, frozen=True):
     role: Literal["position"]
 
 
-class LogInfo(Record, frozen=True, omit_defaults=False):
+class LogInfo(Record, omit_defaults=False):
     """Description of the log file; "unknown" for texts that are not in the log."""
 
     # File name without folder

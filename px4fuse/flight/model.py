@@ -104,7 +104,7 @@ class Columns:
     ]
 
 
-class Alignment(Record, frozen=True, kw_only=True):
+class Alignment(Record, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
     A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the

@@ -13,7 +13,7 @@ DataPath = Literal[
 ]
 
 
-class Origin(Record, frozen=True):
+class Origin(Record):
     """Kind of a position source, and the path of its positions from the sender to the log."""
 
     # "vio" is any source with a changing orientation, "uwb" a noisy one without orientation, and

@@ -7,7 +7,7 @@ from px4fuse.core.reading import display_name
 from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError
 
-_FORMATS = read_toml(__file__, "formats.toml", dict[str, list[dict[str, Any]]])
+_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]])
 # Formats of streams with positions: name, pattern of a row and pattern of the ranges
 STREAM_FORMATS = _FORMATS["streams"]
 

@@ -82,7 +82,7 @@ class FrameOfReference:
     body: bool = False
 
 
-_TABLE = read_toml(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 assert not any(row.optional for row in LAYOUTS.values()), "mavlink_messages.toml: use `columns`"
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])

@@ -179,7 +179,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
         in_frame = (samples["frame_id"] == number) & (not is_body)
         in_child_frame = (samples["child_frame_id"] == number) & (has_quaternion | (not is_body))
         if min(frame.signs) > 0.0:
-            ned_samples.loc[in_frame, orientation] = samples[orientation]
+            ned_samples.loc[in_frame, orientation] = samples.loc[in_frame, orientation]
         for rows, vector_columns, variance_columns in (
             (in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
             (in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),

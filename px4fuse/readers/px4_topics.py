@@ -38,7 +38,7 @@ class TrackSource:
         return find_origin(self.kind, self.path)
 
 
-_TABLE = read_toml(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)

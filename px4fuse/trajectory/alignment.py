@@ -29,7 +29,7 @@ MAX_YAW_RESIDUAL_RATIO = 1.0
 MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
-class Transform(Record, frozen=True):
+class Transform(Record):
     """Similarity transform x ↦ scale · R x + t, from the estimate's frame to the reference's.
 
     Attributes

@@ -23,7 +23,7 @@ MIN_GAP_LIMIT_S = 0.1
 MAX_NEAREST_DIFFERENCE_S = 0.01
 
 
-class Association(Record, frozen=True):
+class Association(Record):
     """Association of the poses of two trajectories by time, with the numbers of unused poses.
 
     Attributes

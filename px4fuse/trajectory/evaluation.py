@@ -52,7 +52,7 @@ _KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
 _MONOCULAR_NAME = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
-class AbsoluteError(Record, frozen=True):
+class AbsoluteError(Record):
     """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
 
     translation_m: Statistics
@@ -60,7 +60,7 @@ class AbsoluteError(Record, frozen=True):
     rotation_deg: OrUnavailable[Statistics]
 
 
-class Evaluation(Record, frozen=True, kw_only=True):
+class Evaluation(Record, kw_only=True):
     """ATE and RPE of an estimate against a reference, with alignment, time offset and tracks.
 
     Attributes

@@ -62,7 +62,7 @@ def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
-class Track(Record, frozen=True):
+class Track(Record):
     """Description of a trajectory and its file, for results.json."""
 
     name: str

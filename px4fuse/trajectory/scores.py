@@ -58,7 +58,7 @@ class Delta:
         return f"{self.value:g} {self.unit}"
 
 
-class Statistics(Record, frozen=True):
+class Statistics(Record):
     """Statistics of ``count`` errors, in the unit of the errors.
 
     The standard deviation ``std`` divides by ``count``.
@@ -73,7 +73,7 @@ class Statistics(Record, frozen=True):
     max: float
 
 
-class Interval(Record, frozen=True):
+class Interval(Record):
     """95 % interval of an RMSE by block bootstrap.
 
     Attributes
@@ -91,7 +91,7 @@ class Interval(Record, frozen=True):
     blocks: float
 
 
-class RelativeError(Record, frozen=True):
+class RelativeError(Record):
     """RPE of pairs of poses with a distance of ``delta``.
 
     Attributes

@@ -65,7 +65,7 @@ MAX_HALF_INTERVAL_S = 0.5
 CONFIDENCE_LEVEL = 0.95
 
 
-class TimeOffset(Record, frozen=True, kw_only=True):
+class TimeOffset(Record, kw_only=True):
     """Time offset between two trajectories.
 
     Attributes

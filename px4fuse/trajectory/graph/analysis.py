@@ -25,7 +25,7 @@ SOLUTIONS: Mapping[str, str] = {
 }
 
 
-class Graph(Record, frozen=True, kw_only=True):
+class Graph(Record, kw_only=True):
     """Pose graph for results.json: size, tests of the closures, and solutions.
 
     Attributes

@@ -41,7 +41,7 @@ _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
 
 
-class Solution(Record, frozen=True, kw_only=True):
+class Solution(Record, kw_only=True):
     """Solution of a pose graph."""
 
     # Half of the sum of the squared Mahalanobis distances at the initial poses
