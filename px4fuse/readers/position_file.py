@@ -140,13 +140,14 @@ def read_position_file(
     """
     _check_options(columns, time_unit, length_unit)
     path, body_in_path = split_path_and_part(str(path))
-    table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
+    body = body or body_in_path
+    table, sha256, size_bytes = _open_table(path, columns, body)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
     quaternion_columns = find_quaternion(table.names)
     numbers, has_time_zone = _read_numbers(
-        table, meanings, chosen_columns, quaternion_columns, body or body_in_path
+        table, meanings, chosen_columns, quaternion_columns, body
     )
     row_count = len(numbers)
     time_column, position, sigma, frame, time_text = _choose_columns(
@@ -156,17 +157,19 @@ def read_position_file(
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
     is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE).all(axis=1)
-    if unusable_count := int(np.count_nonzero(~is_usable)):
+    unusable_rows = numbers.index[~is_usable]
+    if len(unusable_rows):
         notes.append(
-            f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.first_line(numbers.index[~is_usable])}"
+            f"number of dropped rows without valid time or position: {len(unusable_rows)}"
+            f"{table.first_line(unusable_rows)}"
         )
     empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     times = numbers[time_column].to_numpy()
-    name_unit = meanings[time_column].unit if meanings[time_column].unit in TIME_UNITS else ""
     units, interval_range_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
-    unit, unit_text = _time_unit(times, name_unit, time_unit, units, interval_range_s)
+    unit, unit_text = _time_unit(
+        times, meanings[time_column].unit, time_unit, units, interval_range_s
+    )
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
     if table.rate_hz is not None:
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
@@ -180,14 +183,11 @@ def read_position_file(
         )
     is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
     if is_not_time or len(kept_rows) < MIN_USABLE_ROWS:
+        fault = (
+            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
+        )
         raise LogError(
-            "; ".join(
-                (
-                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
-                    f"{MIN_USABLE_ROWS}",
-                    *notes,
-                )
-            ),
+            "; ".join((fault, *notes)),
             f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
@@ -197,12 +197,9 @@ def read_position_file(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
+    max_extent_m = np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
     scale_by_column, length_unit_text = _length_units(
-        numbers,
-        position_columns,
-        meanings,
-        length_unit,
-        np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
+        numbers, position_columns, meanings, length_unit, max_extent_m
     )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
@@ -212,18 +209,18 @@ def read_position_file(
     invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
         invalid_reasons[:] = ""
+    is_valid = invalid_reasons == ""
     invalid_parts = (
-        invalid_reasons[invalid_reasons != ""],
+        invalid_reasons[~is_valid],
         pd.Series("NaN", empty_times / units_per_second),
     )
-    quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
-    samples = samples[invalid_reasons == ""]
+    samples = samples[is_valid]
     notes += _drop_invalid_sigmas(samples)
     is_unix = has_time_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (
-        len(position_columns) < 3
-    )
+    axes_text = frame.upper() if frame else "x, y, z"
+    if len(position_columns) < 3:
+        axes_text += " without height"
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -246,7 +243,9 @@ def read_position_file(
         invalid=pd.concat(invalid_parts).sort_index(),
         format=table.format,
         row_count=row_count,
-        quaternions=quaternions if quaternion_columns else None,
+        quaternions=numbers.loc[is_valid, quaternion_columns].to_numpy()
+        if quaternion_columns
+        else None,
         step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
 
@@ -281,7 +280,7 @@ def _check_options(
         ("time_unit", time_unit, TIME_UNITS),
         ("length_unit", length_unit, LENGTH_UNITS),
     ):
-        if value is not None and value not in units:
+        if value not in (None, *units):
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     names = columns or ("1", "2", "3")
     if "" in names or not 3 <= len({*names}) == len(names) <= 5:
@@ -357,17 +356,18 @@ def _select_body(
 
 def _column_indices(table: Table, columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
-    numbers = [str(index + 1) for index in range(len(names))]
+    # A name is preferred to the number of a column
+    names += [str(index + 1) for index in range(len(names))]
     indices = []
     for column in columns:
         wanted_name = column.strip().casefold()
-        if wanted_name not in names + numbers:
+        if wanted_name not in names:
             raise SettingsError(
                 f"{table.file_name} has no column {quote(column)}; the columns are "
-                f"{table.label(*range(len(names)))}",
+                f"{table.label(*range(len(table.names)))}",
                 f"Name the columns with {COLUMNS_OPTION}.",
             )
-        indices.append((names if wanted_name in names else numbers).index(wanted_name))
+        indices.append(names.index(wanted_name) % len(table.names))
     if len({*indices}) < len(indices):
         raise SettingsError(f"{COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice.")
     return indices
@@ -409,11 +409,11 @@ def _choose_columns(
             ),
         )
         time_text = table.label(time)
-        for index in other_times:
+        for index in [*other_times]:
             are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time] += numbers[index] * 1e-9
-                other_times = [column for column in other_times if column != index]
+                other_times.remove(index)
                 time_text += f" plus {table.label(index)}"
         if other_times:
             time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
@@ -443,7 +443,7 @@ def _time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median = float(np.median(times)) if len(times) else 0.0
-    if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
+    if abs(median) * TIME_UNITS.get(name_unit, np.inf) < UNIX_END_S:
         return name_unit, "the column name contains the unit"
     steps = np.diff(times)
     median_step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
@@ -480,7 +480,8 @@ def _length_units(
         if meaning.unit in LENGTH_UNITS
     }
     # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
-    extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
+    positions = numbers[position_columns]
+    extents = positions.quantile(0.95) - positions.quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
     reason = "px4fuse assumes this unit, because the column names contain no unit"
@@ -502,10 +503,10 @@ def _length_units(
             "px4fuse assumes this unit, because no unit gives the extent of an indoor flight; set "
             "another unit with --position-unit"
         )
-    unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
-    scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
+    units = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
+    scale_by_column = {index: LENGTH_UNITS[name] for index, name in units.items()}
     extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
-    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
+    used_units = ", ".join(dict.fromkeys(units[index] for index in position_columns))
     return (
         scale_by_column,
         f"{used_units} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
