@@ -23,9 +23,16 @@ from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.log import InputFile, clock_of_repeated_timestamps
-from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Alignment,
+    Columns,
+    Flight,
+    InputFile,
+    PositionTrack,
+    Unavailable,
+    clock_of_repeated_timestamps,
+)
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
 

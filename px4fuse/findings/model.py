@@ -13,8 +13,7 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionTrack
-from px4fuse.flight.position_source import PositionKind
+from px4fuse.flight.model import PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record, frozen=True):

@@ -16,15 +16,16 @@ from px4fuse.flight.ekf2_parameters import (
     effective_settings,
     replace_invalid_parameters,
 )
-from px4fuse.flight.log import LogInfo, UnusedData
 from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
     Ekf2,
     Flight,
+    LogInfo,
     Spans,
     TableOrUnavailable,
     Unavailable,
+    UnusedData,
 )
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages

@@ -9,8 +9,7 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable
-from px4fuse.flight.position_source import GNSS, with_orientation
+from px4fuse.flight.model import GNSS, Columns, PositionTrack, Truth, Unavailable, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation

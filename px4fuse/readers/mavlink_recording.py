@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.flight.log import Stream
-from px4fuse.flight.model import Columns, time_index
+from px4fuse.flight.model import Columns, Stream, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.mavlink_clocks import (

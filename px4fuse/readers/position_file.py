@@ -20,7 +20,6 @@ from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid_rows, rounding_step
-from px4fuse.readers.formats import refuse_foreign_format
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_UNITS,
@@ -38,7 +37,7 @@ from px4fuse.readers.recording_table import (
     find_table,
 )
 from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, refuse_foreign_format
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
@@ -140,14 +139,13 @@ def read_position_file(
     """
     _check_options(columns, time_unit, length_unit)
     path, body_in_path = split_path_and_part(str(path))
-    body = body or body_in_path
-    table, sha256, size_bytes = _open_table(path, columns, body)
+    table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
     quaternion_columns = find_quaternion(table.names)
     numbers, has_time_zone = _read_numbers(
-        table, meanings, chosen_columns, quaternion_columns, body
+        table, meanings, chosen_columns, quaternion_columns, body or body_in_path
     )
     row_count = len(numbers)
     time_column, position, sigma, frame, time_text = _choose_columns(
@@ -157,11 +155,10 @@ def read_position_file(
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
     is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE).all(axis=1)
-    unusable_rows = numbers.index[~is_usable]
-    if len(unusable_rows):
+    if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
-            f"number of dropped rows without valid time or position: {len(unusable_rows)}"
-            f"{table.first_line(unusable_rows)}"
+            f"number of dropped rows without valid time or position: {unusable_count}"
+            f"{table.first_line(numbers.index[~is_usable])}"
         )
     empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
@@ -183,11 +180,14 @@ def read_position_file(
         )
     is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
     if is_not_time or len(kept_rows) < MIN_USABLE_ROWS:
-        fault = (
-            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
-        )
         raise LogError(
-            "; ".join((fault, *notes)),
+            "; ".join(
+                (
+                    f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than "
+                    f"{MIN_USABLE_ROWS}",
+                    *notes,
+                )
+            ),
             f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
@@ -197,9 +197,12 @@ def read_position_file(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
-    max_extent_m = np.inf if is_trajectory else MAX_INDOOR_EXTENT_M
     scale_by_column, length_unit_text = _length_units(
-        numbers, position_columns, meanings, length_unit, max_extent_m
+        numbers,
+        position_columns,
+        meanings,
+        length_unit,
+        np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
@@ -209,18 +212,18 @@ def read_position_file(
     invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
         invalid_reasons[:] = ""
-    is_valid = invalid_reasons == ""
     invalid_parts = (
-        invalid_reasons[~is_valid],
+        invalid_reasons[invalid_reasons != ""],
         pd.Series("NaN", empty_times / units_per_second),
     )
-    samples = samples[is_valid]
+    quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
+    samples = samples[invalid_reasons == ""]
     notes += _drop_invalid_sigmas(samples)
     is_unix = has_time_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    axes_text = frame.upper() if frame else "x, y, z"
-    if len(position_columns) < 3:
-        axes_text += " without height"
+    axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (
+        len(position_columns) < 3
+    )
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -243,9 +246,7 @@ def read_position_file(
         invalid=pd.concat(invalid_parts).sort_index(),
         format=table.format,
         row_count=row_count,
-        quaternions=numbers.loc[is_valid, quaternion_columns].to_numpy()
-        if quaternion_columns
-        else None,
+        quaternions=quaternions if quaternion_columns else None,
         step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
 
@@ -280,7 +281,7 @@ def _check_options(
         ("time_unit", time_unit, TIME_UNITS),
         ("length_unit", length_unit, LENGTH_UNITS),
     ):
-        if value not in (None, *units):
+        if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     names = columns or ("1", "2", "3")
     if "" in names or not 3 <= len({*names}) == len(names) <= 5:
@@ -480,8 +481,7 @@ def _length_units(
         if meaning.unit in LENGTH_UNITS
     }
     # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
-    positions = numbers[position_columns]
-    extents = positions.quantile(0.95) - positions.quantile(0.05)
+    extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
     reason = "px4fuse assumes this unit, because the column names contain no unit"
@@ -503,10 +503,10 @@ def _length_units(
             "px4fuse assumes this unit, because no unit gives the extent of an indoor flight; set "
             "another unit with --position-unit"
         )
-    units = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
-    scale_by_column = {index: LENGTH_UNITS[name] for index, name in units.items()}
+    unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
+    scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
     extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
-    used_units = ", ".join(dict.fromkeys(units[index] for index in position_columns))
+    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
     return (
         scale_by_column,
         f"{used_units} ({reason}); 90 % of the positions are within {extent_m:.3g} m",

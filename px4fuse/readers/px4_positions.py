@@ -10,20 +10,23 @@ from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
-from px4fuse.flight.log import SENDER_CLOCK, ClockMap, clock_of_repeated_timestamps
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
+    SENDER_CLOCK,
+    ClockMap,
     Columns,
     Ekf2,
+    Origin,
     PositionTrack,
     Truth,
     Unavailable,
+    clock_of_repeated_timestamps,
     kind_without_orientation,
     sample_rate,
     time_index,
+    with_orientation,
 )
-from px4fuse.flight.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     find_invalid_rows,

@@ -14,7 +14,7 @@ import msgspec
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
-from px4fuse.flight.position_source import Origin, find_origin
+from px4fuse.flight.model import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 

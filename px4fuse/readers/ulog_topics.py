@@ -30,8 +30,7 @@ from px4fuse.flight.ekf2_parameters import (
     REPORTED_PARAMETERS,
     replace_invalid_parameters,
 )
-from px4fuse.flight.log import Dropout, LogInfo, Stream
-from px4fuse.flight.model import ParameterChange, time_index
+from px4fuse.flight.model import Dropout, LogInfo, ParameterChange, Stream, time_index
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 

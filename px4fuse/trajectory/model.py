@@ -11,8 +11,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, Record
+from px4fuse.core.record import Count, Record, one_line_repr
 
 # Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
 TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
