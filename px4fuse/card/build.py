@@ -52,8 +52,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, group_by_root
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.log import LogInfo
-from px4fuse.flight.model import Ekf2, Unavailable, source_name
+from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3

@@ -24,11 +24,12 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD, Stream
 from px4fuse.flight.model import (
+    DIAGNOSIS_WITHHELD,
     Ekf2,
     Flight,
     PositionTrack,
+    Stream,
     Unavailable,
     sample_rate,
 )

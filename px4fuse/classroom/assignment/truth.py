@@ -51,7 +51,7 @@ IGNORED_RESETS_S = 5.0
 # Ratio of the upper to the lower limit of a range from which the student chooses
 PREDICTION_RANGE_FACTOR = 1.35
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
-BEHAVIOUR_RULES = read_toml(__file__, "did.toml", dict[str, dict[str, set[str]]])
+BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
 class TrueMistake(Record, frozen=True):
