@@ -17,7 +17,16 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
+from px4fuse.flight.model import (
+    BAD_ACCELERATION,
+    AxisName,
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    Unavailable,
+    time_index,
+)
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -269,6 +278,40 @@ def samples_by_event(
     samples = np.zeros((len(columns), slot_index.max(initial=-1) + 1, len(event_steps)))
     samples[:, slot_index, event_index] = columns
     return samples
+
+
+def update_table(
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+) -> pd.DataFrame:
+    """Return the updates with one aiding source, in the order of fusion, at measurement times.
+
+    Parameters
+    ----------
+    update_log : ndarray, shape (E, k, ...)
+        For k samples of each event: ν and S along each axis, 1 for a sample that was rejected,
+        fused, or used for a reset, position variance after the update and R along each axis (the
+        last quantities are optional). NaN without a sample.
+    measured_at_s : ndarray, shape (E, k)
+    end_s : ndarray, shape (E,)
+        Time of each event.
+    axes : sequence of str
+    """
+    has_innovation = np.isfinite(update_log[..., 0])
+    columns = [
+        *(f"innovation_{axis}_m" for axis in axes),
+        *(f"innovation_variance_{axis}_m2" for axis in axes),
+        "rejected",
+        "fused",
+        "reset",
+        *(f"position_variance_{axis}_m2" for axis in axes),
+        *(f"observation_variance_{axis}_m2" for axis in axes),
+    ]
+    updates = pd.DataFrame(
+        update_log[has_innovation],
+        time_index(measured_at_s[has_innovation]),
+        columns[: update_log.shape[-1]],
+    )
+    return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
