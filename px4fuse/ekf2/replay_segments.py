@@ -101,6 +101,9 @@ class SensorSamples:
         R of one sample; 0 if R is a parameter.
     gate : float
         Innovation gate in √S; infinite if the gate is a parameter.
+    state_rows : tuple of slice
+        State (NED vector) that the sensor measures in the body frame and, optionally, state (body
+        frame) that is added to the measurement.
     """
 
     step: IntArray
@@ -109,6 +112,7 @@ class SensorSamples:
     sample_count: Array
     noise: Array
     gate: float = np.inf
+    state_rows: tuple[slice, ...] = (EARTH_FIELD, BODY_FIELD)
 
 
 @dataclass(frozen=True)
