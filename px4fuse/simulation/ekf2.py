@@ -211,9 +211,16 @@ def _make_segment(
     attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
         :, HEADING
     ]
-    mean_imu_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_BEFORE_LOG_S)
+    force_m_s2, rate_rad_s = sensors.measure_imu(
+        scenario,
+        mistakes,
+        motion,
+        np.zeros(1),
+        sensors.random_stream(scenario, sensors.Stream.REST),
+        REST_BEFORE_LOG_S * scenario.imu_rate_hz,
+    )
     state, covariance = _initial_state_at_rest(
-        body_to_ned[0], *mean_imu_at_rest, float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
