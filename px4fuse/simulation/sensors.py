@@ -117,9 +117,7 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
-    force_m_s2, rate_rad_s = measure_imu(
-        scenario, mistakes, motion, seconds(time_us), random_stream(scenario, Stream.IMU)
-    )
+    force_m_s2, rate_rad_s = measure_imu(scenario, mistakes, motion, seconds(time_us), Stream.IMU)
     if mistakes.vibration_m_s2:
         vibration_sigma_m_s2 = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force_m_s2 += vibration_sigma_m_s2 * random_stream(
@@ -169,12 +167,13 @@ def height_error(scenario: Scenario, time_s: Array) -> Array:
 
 def limit_rate(unlimited_topic: Topic, rate_hz: float) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    return _select_messages(unlimited_topic, keep_at_rate(time_s(unlimited_topic), rate_hz))
+    times_s = seconds(time_us(unlimited_topic))
+    return _select_messages(unlimited_topic, keep_at_rate(times_s, rate_hz))
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
-    times_s = time_s(full_topic)
+    times_s = seconds(time_us(full_topic))
     is_outside_gap = _is_outside_gap(
         times_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
     )
@@ -183,9 +182,9 @@ def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     )
 
 
-def time_s(topic: Topic) -> Array:
-    """Return the publication time of each message, seconds from the first data."""
-    return seconds(topic.fields["timestamp"].astype(np.int64) - START_US)
+def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
+    """Return the publication time (or another time) of each message, µs from the first data."""
+    return np.asarray(topic.fields[field].astype(np.int64) - START_US)
 
 
 def _select_messages(topic: Topic, is_kept: BoolArray) -> Topic:
@@ -197,12 +196,12 @@ def measure_imu(
     mistakes: Mistakes,
     motion: Motion,
     time_s: Array,
-    rng: np.random.Generator,
+    stream: Stream,
     mean_count: float = 1.0,
 ) -> ArrayPair:
     """Simulate specific force (m/s²) and angular rate (rad/s), mean of ``mean_count`` samples."""
     truth = attitude(motion.at(time_s))
-    measured = []
+    rng, measured = random_stream(scenario, stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
         biases(scenario, mistakes),

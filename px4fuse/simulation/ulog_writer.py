@@ -92,12 +92,11 @@ def encode(
         content.append(
             _keyed_message("P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value))
         )
+    data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
         content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
         )
-    data_messages: list[bytes] = []
-    for topic_id, topic in enumerate(topics):
         data_messages += _data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
     content += [
