@@ -13,6 +13,7 @@ Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -104,8 +105,9 @@ def add_heights(
                 for name in ("bias_m", "bias_m2")
             )
             barometer_bias = bias_m, bias_m2
-        columns = measured_at_s, down_m, dead_zone_m, sample_weight
-        samples_inside = barometer_samples_inside(segment, *columns)
+        samples_inside = barometer_samples_inside(
+            segment, measured_at_s, down_m, dead_zone_m, sample_weight
+        )
         rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
@@ -117,16 +119,11 @@ def add_heights(
 
 
 def barometer_samples_inside(
-    segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array, weight: Array
-) -> tuple[IntArray, Array, Array, Array, Array]:
-    """Return the barometer samples inside a segment.
-
-    For each sample: prediction step that fuses it, time (s), height (m, down), dead zone (m),
-    weight.
-    """
+    segment: ReplaySegment, measured_at_s: Array, *more: Array
+) -> tuple[Any, ...]:
+    """Return step, time (s) and ``more`` (:class:`HeightSamples`) of the samples in a segment."""
     step, is_inside = sample_steps(segment, measured_at_s)
-    measured_at_s, down_m = measured_at_s[is_inside], down_m[is_inside]
-    return step, measured_at_s, down_m, dead_zone_m[is_inside], weight[is_inside]
+    return step, *(values[is_inside] for values in (measured_at_s, *more))
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
@@ -137,10 +134,20 @@ def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[
     """
     heights = segment.heights
     assert heights is not None
-    age_dead_zone_weight = heights.measured_at_s, heights.dead_zone_m, heights.weight
-    columns = heights.down_m[:, None], slice(2, 3), *age_dead_zone_weight
     return pad_samples(
-        [samples_by_event(segment, event_steps, heights.step, *columns) for event_steps in ends]
+        [
+            samples_by_event(
+                segment,
+                event_steps,
+                heights.step,
+                heights.down_m[:, None],
+                slice(2, 3),
+                heights.measured_at_s,
+                heights.dead_zone_m,
+                heights.weight,
+            )
+            for event_steps in ends
+        ]
     )
 
 

@@ -209,11 +209,7 @@ def replay_settings(
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
-                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
-                "the log lacks some fused magnetometer samples",
-            ),
-            (
-                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
+                MAG.measurement_parameters.union(FIELD_NOISE_PARAMETERS),
                 "the log lacks some fused magnetometer samples",
             ),
             (
@@ -221,7 +217,7 @@ def replay_settings(
                 height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
             ),
         ):
-            reasons |= dict.fromkeys(unmodelled_parameters & {*parameter_names}, reason)
+            reasons |= dict.fromkeys(unmodelled_parameters & parameter_names, reason)
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         reasons["EKF2_DELAY_MAX"] = (
@@ -241,7 +237,6 @@ def replay_settings(
         )
     if not changes:
         return ()
-    uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
         excluded_rows = matching_sample_rows(inputs.received.stamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
@@ -257,7 +252,7 @@ def replay_settings(
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
-            uses_logged_decisions=uses_logged_decisions,
+            uses_logged_decisions=excluded_s is not None,
             without=without,
         )
         for change in changes
