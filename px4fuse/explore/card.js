@@ -9,7 +9,8 @@ const Card = (() => {
 
   function start({ bands, ends, marks }, suffix) {
     const figures = new Map([...$(`figures${suffix}`).content.children].map((figure) => [figure.dataset.axis, figure]));
-    let analysed = null; // texts of the card with the settings of the analysis
+    // texts of the card with the settings of the analysis
+    let analysed = null;
 
     const fraction = (ratio) => Math.log(ratio / ends[0]) / Math.log(ends[1] / ends[0]);
     /* Verdict on a ratio (verdicts.py): consistent in its band, or if its 95 % interval contains 1 */
@@ -66,7 +67,8 @@ const Card = (() => {
     function showTexts(now, effect, isChanged) {
       const [sign, headlineNode, effectNode, recorded] = ["sign", "headline", "effect", "recorded"]
         .map((name) => query(`#card [data-part=${name}]`));
-      if (headlineNode === null) return; // practice hides them before the answer
+      // practice hides them before the answer
+      if (headlineNode === null) return;
       analysed ??= { sign: sign.textContent, headline: headlineNode.textContent, effect: effectNode.textContent,
         className: sign.className };
       const shown = isChanged ? { sign: "SETTINGS CHANGED", headline: headline(now), effect, className: "sign note" } : analysed;
@@ -74,7 +76,8 @@ const Card = (() => {
       headlineNode.textContent = shown.headline;
       effectNode.textContent = shown.effect;
       recorded.hidden = !isChanged;
-      query("#card .do")?.toggleAttribute("hidden", isChanged); // its advice is for the analysed settings
+      // its advice is for the analysed settings
+      query("#card .do")?.toggleAttribute("hidden", isChanged);
       recorded.textContent = `With the analysed settings: ${analysed.sign} ${analysed.headline}`;
     }
     return { showAxis, moveMarks, showTexts, verdicts };

@@ -76,8 +76,10 @@ const Practice = (() => {
       box.append(make("p", `${fault}: ${size}, ${time}. ${symptom}`), button);
     }
     box.hidden = false;
-    $("card").innerHTML = solution.card; // px4fuse has escaped its texts
-    for (const button of queryAll("[data-apply]")) { // without the log file in the command
+    // px4fuse has escaped its texts
+    $("card").innerHTML = solution.card;
+    // without the log file in the command
+    for (const button of queryAll("[data-apply]")) {
       button.previousElementSibling.textContent = button.dataset.apply.replace(/^.*? (?=--)/, "");
     }
     page.open(solution.mistakes[0]?.view ?? "errors");
