@@ -1,5 +1,5 @@
-/* Diagnosis card for the settings of the page: axis of σ ratios, headline and effect. Numbers and words
-   as in px4fuse.card. */
+// Diagnosis card for the settings of the page: axis of σ ratios, headline and effect. Numbers and words
+// as in px4fuse.card.
 const Card = (() => {
   const NAMES = { source: "the source", truth: "ground truth" };
   // format_ratio and format_metres of core/text.py
@@ -12,7 +12,6 @@ const Card = (() => {
     // texts of the card with the settings of the analysis
     let analysed = null;
 
-    const fraction = (ratio) => Math.log(ratio / ends[0]) / Math.log(ends[1] / ends[0]);
     /* Verdict on a ratio (verdicts.py): consistent in its band, or if its 95 % interval contains 1 */
     function wordOf(ratio, against, interval) {
       const [low, high] = bands[against];
@@ -44,7 +43,7 @@ const Card = (() => {
         const show = (node, isShown) => node.setAttribute("display", isShown ? "inline" : "none");
         show(was, isChanged);
         for (const line of row.querySelectorAll(".interval")) show(line, !isChanged);
-        const value = isChanged ? verdict.ratio : axis.ratios[i], place = fraction(value);
+        const value = isChanged ? verdict.ratio : axis.ratios[i], place = axisFraction(value, ends);
         mark.setAttribute("x", `${100 * clamp(place, 0, 1)}%`);
         mark.firstChild.setAttribute("d", marks[place < 0 ? "below" : place > 1 ? "above" : verdict.against]);
         const shown = isChanged ? { ratio: formatRatio(value), word: verdict.word, isLoud: verdict.word !== "consistent" }

@@ -1,5 +1,5 @@
-/* KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
-   steps, the same mean acceleration per step, the same Joseph update. */
+// KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
+// steps, the same mean acceleration per step, the same Joseph update.
 "use strict";
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 /* Response with the decompressed bytes of a base64 text */
@@ -131,8 +131,8 @@ const Engine = (() => {
     return { steps, updates, settings };
   }
 
-  /* Position, velocity and position variance at other ascending times, NaN outside the KF run
-     (kalman.state_at and variance_at) */
+  // Position, velocity and position variance at other ascending times, NaN outside the KF run
+  // (kalman.state_at and variance_at)
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
     const position = new Float64Array(times.length), velocity = position.slice(), variance = position.slice();

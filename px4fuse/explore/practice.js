@@ -1,5 +1,5 @@
-/* Practice: current flight, answers of the student and score. The page address contains them, so a reload keeps them.
-   The solution of a flight is decoded only after the student's answer. */
+// Practice: current flight, answers of the student and score. The page address contains them, so a reload keeps them.
+// The solution of a flight is decoded only after the student's answer.
 const Practice = (() => {
   const count = Number($("quiz").dataset.flights), address = new URLSearchParams(location.hash.slice(1));
   const savedAnswers = (address.get("answers") ?? "").split("~").slice(0, count);

@@ -1,5 +1,5 @@
-/* Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
-   the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers. */
+// Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
+// the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers.
 const Step = (() => {
   const CORNERS = 120;
   // number of previous KF steps whose positions and velocities are drawn

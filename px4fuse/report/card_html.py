@@ -51,7 +51,7 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the diagnosis card as an HTML element.
+    """Return the diagnosis card as an HTML element; dir="auto" isolates names in another direction.
 
     Parameters
     ----------
