@@ -287,5 +287,7 @@ def test_random_answer_forms_earn_at_most_20_percent() -> None:
     """500 random forms on flights with two faults, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
-    earned = [form_points(at_random(rng), truths[n % 3]).fraction for n in range(500)]
+    earned = [
+        form_points(at_random(rng, truths[n % 3]), truths[n % 3]).fraction for n in range(500)
+    ]
     assert np.mean(earned) <= 0.2

@@ -267,7 +267,7 @@ def _write_assignment(
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.random_assignment import (
         EASIEST_DIFFICULTY,
-        HARDEST_DIFFICULTY,
+        UNDETECTABLE_DIFFICULTY,
     )
     from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.report.page import Page
@@ -293,7 +293,7 @@ def _write_assignment(
         "Class": f"{flight_count} student{'s' * (flight_count != 1)}, {kind}",
         "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
         "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
+        f"{EASIEST_DIFFICULTY:g} to {UNDETECTABLE_DIFFICULTY:g}. The difficulty is the smallest "
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_files} logs written, {flight_count - written_files} "
         "existed already)",
