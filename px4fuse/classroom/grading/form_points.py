@@ -102,11 +102,10 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.mistakes and len(false_mistakes) < MIN_FALSE_MISTAKES_WITHOUT_POINTS:
         fractions |= _mistake_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
-    # half of the points for the verdicts if no computed number is right, because most verdicts can
-    # be guessed
-    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (
-        1.0 if quantities_fraction else 0.5
-    )
+    # half of the points for the verdicts on a flight with faults if no computed number is right,
+    # because most verdicts can be guessed
+    is_guess_possible = not quantities_fraction and not is_no_mistake_right
+    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (0.5 if is_guess_possible else 1.0)
     points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
     if is_no_mistake_right:
         points_by_part["mistakes"] = weights["mistakes"]
