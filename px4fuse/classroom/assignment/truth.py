@@ -131,7 +131,11 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
 def compare_simulation(simulation: flights.Simulation) -> Comparison:
     """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    prepared = prepare(flight, ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M))
+    prepared = prepare(
+        flight,
+        ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
+        as_sent=True,  # assigned logs are analysed without corrections, too
+    )
     return compare(prepared, run_kf(prepared))
 
 
