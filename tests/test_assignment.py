@@ -30,7 +30,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     draw,
 )
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop
 from px4fuse.loop.analysis import analyse
@@ -194,7 +194,7 @@ def test_each_fault_in_assigned_log_is_detected_by_analysis(
     if kind == "loop":
         found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
-        found = explain(compare(flight, axes=("north", "east"))).findings
+        found = find_faults(compare(flight, axes=("north", "east"))).findings
     drawn = draw(SECRET, CLASS[number].student_id, kind, count)
     wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count

@@ -17,7 +17,7 @@ from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
 from px4fuse.results.answer_form import CHOICE_NAMES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json

@@ -297,7 +297,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map with the main axis to the right; without a main axis, north is up."""
-    aisle_axis = next((line for line in analysis.lines if line.name == AISLE), None)
+    aisle_axis = next((line for line in analysis.input_axes if line.name == AISLE), None)
     heading_rad, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle_axis is not None and aisle_axis.heading_deg is not None:
         heading_rad, up_label = np.deg2rad(aisle_axis.heading_deg % 180.0), "left (m)"

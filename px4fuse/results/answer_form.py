@@ -57,7 +57,7 @@ class FormChoices(Record, frozen=True):
     renamed: dict[str, str]
 
 
-_CHOICES = read_toml(__file__, "form.toml", FormChoices)
+_CHOICES = read_toml(__file__, FormChoices, "form.toml")
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
 # Units of the value of a correction (empty without a value), by name of the correction

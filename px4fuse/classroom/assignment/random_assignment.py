@@ -109,7 +109,7 @@ class DrawingRules(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = read_toml(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
+RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, DrawingRules], "drawn.toml")
 
 
 @dataclass(frozen=True)

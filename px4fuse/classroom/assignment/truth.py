@@ -47,7 +47,7 @@ MIN_RESET_M = 0.2
 # first position
 IGNORED_RESETS_S = 5.0
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
-BEHAVIOUR_RULES = read_toml(__file__, "did.toml", dict[str, dict[str, set[str]]])
+BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
 class TrueMistake(Record, frozen=True):

@@ -68,7 +68,7 @@ class _CorrectionRule(NamedTuple):
     right_values: tuple[float, float] | str = ANY_BOUNDS
 
 
-POINTS_TABLE = read_toml(__file__, "form_points.toml", dict)
+POINTS_TABLE = read_toml(__file__, dict)
 CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
 NEIGHBOURS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(POINTS_TABLE["weights"])
