@@ -124,6 +124,6 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
     except ValueError as error:
         unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
         number = convert_to_unit(value, unit)
-        unit_text = f" in {UNIT_NAMES[unit]}" if unit else ""
+        unit_text = f" in {UNIT_NAMES.get(unit, unit)}" if unit else ""
         expected_text = "" if number is None else f"{unit_text}. Give {number:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{expected_text}.") from error
