@@ -102,7 +102,8 @@ NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, DISTURBANCES = (
     {
         name: msgspec.convert(
-            {"name": name, **row} | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
+            {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
