@@ -130,8 +130,8 @@ def analysis(
     by_name = {each.axis.name: each for each in axes}
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
-        main=next(iter(axes), axis()), lines=tuple(each.axis for each in axes), segment=SEGMENT,
-        settings=settings, notes=notes, missing=missing,
+        main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
+        segment=SEGMENT, settings=settings, notes=notes, missing=missing,
         **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
         main_trials=[t for t in parts.get("trials", ()) if t.kinds],
     )  # fmt: skip

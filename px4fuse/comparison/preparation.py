@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convention_faults, correct_convention
@@ -49,7 +49,9 @@ NO_SEPARATE_TRUTH = Unavailable(
 GNSS_AXES = (AISLE, "north", "east")
 
 
-def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
+def prepare(
+    flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
+) -> PreparedComparison:
     """Choose position source, segment and axes of a flight.
 
     With ``as_sent``, axes, unit and clock of the source are neither checked nor corrected.
@@ -112,7 +114,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         settings = replace(settings, input="zero")
         notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
-    return Comparison(
+    return PreparedComparison(
         flight,
         source_track,
         source_reason,
@@ -121,7 +123,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         compared_axes,
         notes,
         missing,
-        convention=convention,
+        convention,
     )
 
 
