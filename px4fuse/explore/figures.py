@@ -68,7 +68,7 @@ LINE_STYLES = {
 }
 
 
-class Plot(Record, frozen=True):
+class Plot(Record):
     """Plot over time.
 
     Attributes
@@ -82,14 +82,14 @@ class Plot(Record, frozen=True):
     unit: str = ""
 
 
-class View(Record, frozen=True):
+class View(Record):
     """Tab of the page; ``plots`` are the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
 
 
-class Figures(Record, frozen=True):
+class Figures(Record):
     """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]

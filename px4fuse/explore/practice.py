@@ -62,7 +62,7 @@ FINDING_WITH_TIME_BY_MISTAKE = {
 NOISY_UWB = "noisy-uwb"
 
 
-class HiddenMistake(Record, frozen=True):
+class HiddenMistake(Record):
     """Injected fault in a practice flight.
 
     Attributes
@@ -87,7 +87,7 @@ class HiddenMistake(Record, frozen=True):
     has_either_sign: bool = False
 
 
-class MistakeTable(Record, frozen=True):
+class MistakeTable(Record):
     """Answers of the quiz with their texts, and the injected faults (``practice.toml``)."""
 
     choices: dict[str, str]

@@ -29,7 +29,7 @@ NO_MISTAKE_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
-class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
+class MistakeKind(Record, rename={"size_quantity": "in"}):
     """Injected fault that a student can name, with the quantity of its size.
 
     ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
@@ -45,7 +45,7 @@ class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
         return _UNITS[self.size_quantity]
 
 
-class FormChoices(Record, frozen=True):
+class FormChoices(Record):
     """Allowed answers of the answer form (``form.toml``), and new names of old answers."""
 
     behaviours: tuple[str, ...]
@@ -94,7 +94,7 @@ CHOICES_HEAD = """
 """
 
 
-class Choice(Record, frozen=True):
+class Choice(Record):
     """Question about a figure, with five answers: the student chooses one."""
 
     question: str
@@ -110,7 +110,7 @@ class Choice(Record, frozen=True):
         return "\n#     ".join([self.question, *options])
 
 
-class StudentMistake(Record, frozen=True):
+class StudentMistake(Record):
     """Injected fault of a flight that a student names in the answer form.
 
     ``from_s`` and ``until_s`` are times since the first data. ``parameter`` is a correction with a
@@ -145,7 +145,7 @@ class StudentMistake(Record, frozen=True):
         return self.value * units.get(self.value_unit, 1.0)
 
 
-class Answers(Record, frozen=True, kw_only=True):
+class Answers(Record, kw_only=True):
     """Student's answers about one flight; answers left blank are absent.
 
     Attributes
@@ -181,7 +181,7 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 )
 
 
-class FormQuestion(Record, frozen=True):
+class FormQuestion(Record):
     """Question about KF along the main axis, which the student answers with an own filter.
 
     Attributes
