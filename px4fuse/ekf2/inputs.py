@@ -38,6 +38,7 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
+    POSITION_FILE,
     Columns,
     Ekf2,
     Flight,
@@ -47,7 +48,6 @@ from px4fuse.flight.model import (
     reset_times_s,
     step_values_at,
 )
-from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ

@@ -13,8 +13,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Share
+from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
 from px4fuse.ekf2.heights import SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise

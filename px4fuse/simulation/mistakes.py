@@ -104,7 +104,7 @@ MISTAKES: Mapping[str, Mistake] = {
             field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
         ),
     )
-    for name, mistake in read_toml(__file__, "mistakes.toml", dict[str, Mistake]).items()
+    for name, mistake in read_toml(__file__, dict[str, Mistake]).items()
 }
 
 

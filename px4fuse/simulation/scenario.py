@@ -149,7 +149,7 @@ class Scenario:
     truth_rate_hz: float = 50.0
     truth: bool = True
     ekf2: bool = True
-    seed: int = bounded_number(1, 0, 2**32 - 1, "", "--seed")
+    seed: int = bounded_number(1, 0, 2**128 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

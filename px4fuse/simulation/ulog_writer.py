@@ -19,7 +19,7 @@ _ULOG_VERSION = b"\x01"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
 # Types, defaults and names of the fields of each topic
-TOPIC_FIELDS = read_toml(__file__, "topics.toml", dict[str, str])
+TOPIC_FIELDS = read_toml(__file__, dict[str, str], "topics.toml")
 
 
 @dataclass(frozen=True)
