@@ -90,8 +90,8 @@ const Explore = (async () => {
     showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
-    const [sigmaA, sigmaZ] = likelyNow();
-    set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
+    const [sigmaA, sigmaZ] = likelyNow().map((value) => round(value, 3));
+    set({ sigmaA, sigmaZ, dt: flight.settings.dt });
     showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
   onClick("ekf2-r", () => {

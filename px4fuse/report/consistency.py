@@ -171,7 +171,7 @@ def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
         highest_nis = max(highest_nis, 1.4 * settled_nis.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest_nis, highest_nis))
-    set_plain_ticks(axes.yaxis)
+    set_plain_ticks(axes)
 
 
 def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
