@@ -257,7 +257,6 @@ def _phase_plot() -> Any:
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
     _add_cursor(plot_figure, name="measurement", line_dash=[2, 2])
-    plot_figure.line("p", "v", source=_empty_source("trail-means"), name="measured")
     plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
     plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
     _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")
