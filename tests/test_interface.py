@@ -132,7 +132,7 @@ def test_python_table_contains_the_numbers_of_the_results(analysis) -> None:
     for (axis, name), row in table.drop(("down", "ekf2")).iterrows():
         summary = analysis[axis].filters[name]
         assert (row["nis_low"], row["nis_high"]) == summary.nis_band
-        for column in COLUMNS.keys() - {"nis_low", "nis_high"}:
+        for column in set(COLUMNS) - {"nis_low", "nis_high"}:
             truth = column in type(summary.truth).__struct_fields__ and column != "count"
             assert row[column] == getattr(summary.truth if truth else summary, column)
 

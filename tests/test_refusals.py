@@ -83,7 +83,7 @@ REFUSED = {
         "--clock-offset SECONDS",
     ),
     # slips, and what to type instead
-    "slip of a command": ("comapre x.ulg", "Did you mean 'compare'?"),
+    "slip of a command": ("comapre x.ulg", "Did you mean compare?"),
     "no command": ("l.ulg --dt 0.2", "px4fuse compare l.ulg --dt 0.2"),
     "slip of an option": ("compare l.ulg --sigmaz 1", "--sigma-z"),
     "metres with a unit": (

@@ -49,18 +49,16 @@ from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
-from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, group_by_root
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.log import LogInfo
-from px4fuse.flight.model import Ekf2, Unavailable, source_name
+from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-KF_SETTINGS = {"sigma_a_m_s2": "SIGMA_A", "sigma_z_m": "SIGMA_Z", "dt_s": "DT"}
 # Minimum fraction of positions rejected by EKF2 that the diagnosis card states
 MIN_NAMED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
@@ -552,13 +550,14 @@ def _make_identity(
 def _settings_text(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
     setting_texts = []
-    for name, label in KF_SETTINGS.items():
+    for name in KF_NUMBERS:
         value, value_origin = getattr(settings, name), "set by the user"
+        unit, label = SETTING_RANGES[name][2:]
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             value_origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):
             value_origin = "default"
-        setting_texts.append(f"{label} {value:g} {SETTING_RANGES[name].unit} ({value_origin})")
+        setting_texts.append(f"{label} {value:g} {unit} ({value_origin})")
     return ", ".join(setting_texts)
 
 
@@ -566,7 +565,7 @@ def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
-        for name in KF_SETTINGS
+        for name in KF_NUMBERS
         if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
     )
 

@@ -1,14 +1,13 @@
 """Records of a comparison: inputs, results along each axis, and the tracks of both filters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import (
     NOT_WRITTEN,
     Count,
@@ -21,6 +20,7 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
     Vector,
+    one_line_repr,
 )
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
@@ -150,21 +150,17 @@ class AxisComparison(Record, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Inputs of a comparison and, after the filters ran, the results along each axis.
+class PreparedComparison:
+    """Inputs of a comparison, before KF runs.
 
     Attributes
     ----------
     settings : Settings
         Settings of KF; ``input`` is "zero" if the log has no acceleration.
-    lines : tuple of Axis
+    input_axes : tuple of Axis
         Axes with their measurements and accelerations, the inputs of KF.
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
-    axes : mapping from axis name to AxisComparison
-        Empty before the filters run.
-    horizontal : mapping from "kf" and "ekf2" to HorizontalNis
-        NIS of north and east together, if both were analysed.
     convention : Convention or None
         Axes, unit and clock with which the source was sent; ``source`` is already converted.
     """
@@ -174,14 +170,27 @@ class Comparison:
     source_reason: str
     segment: Segment
     settings: Settings
-    lines: tuple[Axis, ...]
+    input_axes: tuple[Axis, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
-    axes: Mapping[str, AxisComparison] = field(default_factory=dict)
-    horizontal: Mapping[FilterName, HorizontalNis] = field(default_factory=dict)
-    convention: Convention | None = None
+    convention: Convention | None
 
     __repr__ = one_line_repr
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(PreparedComparison):
+    """Results of a comparison along each axis, with its inputs.
+
+    Attributes
+    ----------
+    axes : mapping from axis name to AxisComparison
+    horizontal : mapping from "kf" and "ekf2" to HorizontalNis
+        NIS of north and east together, if both were analysed.
+    """
+
+    axes: Mapping[str, AxisComparison]
+    horizontal: Mapping[FilterName, HorizontalNis]
 
     def __getitem__(self, axis: str) -> AxisComparison:
         """Return the comparison along an axis, by its name.

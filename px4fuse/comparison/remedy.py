@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import inside_spans
@@ -112,7 +112,7 @@ def ml_delay_change(
 
 
 def wrong_delay_ms(
-    comparison: Comparison, clock_offset: ClockOffset, logged_delay_ms: float
+    comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
     ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
@@ -128,12 +128,12 @@ def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float)
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
 
 
-def aid_of(comparison: Comparison, axis: str = "") -> Aid:
+def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
     """Return EKF2's aiding source for the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
-def delay_ms(comparison: Comparison) -> float | None:
+def delay_ms(comparison: PreparedComparison) -> float | None:
     """Return the delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
     None if the parameter is not logged or EKF2 does not use it.

@@ -152,6 +152,11 @@ def format_metres(length_m: float) -> str:
     return f"{length_m:.{decimals}f}"
 
 
+def replace_unencodable(text: str) -> str:
+    """Replace bytes of a path or command line that are not valid UTF-8 by question marks."""
+    return text.encode(errors="replace").decode()
+
+
 def with_log_name(text: str, log_name: str) -> str:
     """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
 

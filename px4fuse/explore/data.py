@@ -1,5 +1,6 @@
 """Data of one flight for the explore page, which runs KF in the browser."""
 
+from dataclasses import asdict
 from typing import Any
 
 import msgspec
@@ -39,7 +40,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
     assert request is not None
     return {
         "log": analysis.flight.log.name,
-        "settings": _settings_data(analysis.settings),
+        "settings": asdict(analysis.settings),
         "main": analysis.main.axis.name,
         "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
         **signals,
@@ -67,17 +68,15 @@ def replay_signals(comparison: Comparison, packer: Packer) -> PageData:
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _imu_data(comparison, packer),
-        "axes": [_axis_signals(comparison, line, source, packer) for line in comparison.lines],
+        "axes": [_axis_signals(comparison, axis, source, packer) for axis in comparison.input_axes],
     }
 
 
 def ranges() -> PageData:
     """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
     return {
-        "sigma-a": SETTING_RANGES["sigma_a_m_s2"][:2],
-        "sigma-z": SETTING_RANGES["sigma_z_m"][:2],
-        "dt": SETTING_RANGES["dt_s"][:2],
-        "lesson": _settings_data(Settings()),
+        "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
+        "lesson": asdict(Settings()),
         "bands": CONSISTENT_RATIOS,
         "ends": RATIO_AXIS_ENDS,
         "marks": MARK_PATHS,
@@ -87,16 +86,6 @@ def ranges() -> PageData:
 def raw_source(comparison: Comparison) -> PositionTrack:
     """Return the position source without the applied time offset."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
-
-
-def _settings_data(settings: Settings) -> PageData:
-    return {
-        "sigmaA": settings.sigma_a_m_s2,
-        "sigmaZ": settings.sigma_z_m,
-        "dt": settings.dt_s,
-        "input": settings.input,
-        "offset": settings.clock_offset_s,
-    }
 
 
 def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
@@ -116,7 +105,7 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
 
 def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     """Return times, gaps and span of the acceleration, or the reason why it is missing."""
-    acceleration = comparison.lines[0].acceleration
+    acceleration = comparison.input_axes[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time_s = acceleration.time_s
@@ -276,7 +265,7 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
     }
 
 
-def _command_data(request: ComparisonRequest, comparison: Comparison) -> PageData:
+def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return the `compare` command, with automatic and with explicit segment and aisle.
 
     Automatic segment and aisle depend on the clock offset, so a command with another offset states
@@ -286,22 +275,20 @@ def _command_data(request: ComparisonRequest, comparison: Comparison) -> PageDat
     automatic_request = msgspec.structs.replace(
         request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
-    aisle_heading_deg = next(
-        (line.heading_deg for line in comparison.lines if line.name == AISLE), None
-    )
+    heading_deg = request.heading_deg
+    if heading_deg is None and AISLE in analysis.axes:
+        heading_deg = analysis[AISLE].heading_deg
     explicit_request = msgspec.structs.replace(
         automatic_request,
-        start_s=comparison.segment.start_s,
-        end_s=comparison.segment.end_s,
-        heading_deg=aisle_heading_deg
-        if automatic_request.heading_deg is None
-        else automatic_request.heading_deg,
+        start_s=analysis.segment.start_s,
+        end_s=analysis.segment.end_s,
+        heading_deg=heading_deg,
     )
     return {
         "base": command_line(automatic_request, for_shell=True),
         "fixed": command_line(explicit_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
-        if isinstance(comparison.lines[0].acceleration, Unavailable)
+        if isinstance(analysis.main.axis.acceleration, Unavailable)
         else "imu",
     }

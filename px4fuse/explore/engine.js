@@ -50,7 +50,7 @@ const Engine = (() => {
 
   /* Time steps of KF: grid of DT and measurement times (kalman.timeline) */
   function timeline(flight, axis, settings) {
-    const { time: all, z } = measured(axis, flight.segment, settings.offset);
+    const { time: all, z } = measured(axis, flight.segment, settings.clock_offset_s);
     if (all.length < MIN_MEASUREMENTS) return null;
     const first = all[0], times = [], index = [];
     for (let i = 1; i < all.length; i++) {
@@ -61,11 +61,11 @@ const Engine = (() => {
     }
     if (!times.length) return null;
     const m = times.length, last = times[m - 1];
-    const count = Math.floor((last - first) / settings.dt + 1e-9) + 1;
+    const count = Math.floor((last - first) / settings.dt_s + 1e-9) + 1;
     const time = new Float64Array(count + m + 1), measurement = new Int32Array(count + m + 1).fill(-1);
     let n = 0, j = 0;
     for (let k = 0; k < count; k++) {
-      const t = first + settings.dt * k;
+      const t = first + settings.dt_s * k;
       while (j < m && times[j] < t) { measurement[n] = index[j]; time[n++] = times[j++]; }
       const near = Math.min(
         Math.abs(times[Math.min(j, m - 1)] - t), Math.abs(times[Math.max(j - 1, 0)] - t));
@@ -84,7 +84,7 @@ const Engine = (() => {
     for (let from = 0; from < n;) {
       let to = from, gap = 0;
       do gap += gapFraction[to] * (line.time[to + 1] - line.time[to]); while (line.measurement[++to] < 0 && to < n);
-      const persistence = Math.max(gap / settings.dt, 1);
+      const persistence = Math.max(gap / settings.dt_s, 1);
       for (let i = from; i < to; i++) extra[i] = gapFraction[i] * persistence * axis.rms ** 2;
       from = to;
     }
@@ -93,13 +93,13 @@ const Engine = (() => {
 
   /* Set row i of all columns */
   const write = (columns, i, values) => { for (const name in values) columns[name][i] = values[name]; };
-  const processNoise = (settings, extra) => (settings.sigmaA * settings.sigmaA + extra) * settings.dt;
-  /* Run KF (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
+  const processNoise = (settings, extra) => (settings.sigma_a_m_s2 * settings.sigma_a_m_s2 + extra) * settings.dt_s;
+  /* Run KF (px4fuse.replay); `settings` has the fields of px4fuse.Settings */
   function replay(flight, axis, settings) {
     const line = timeline(flight, axis, settings);
     if (line === null) return null;
     const { mean, extra } = inputs(flight, axis, settings, line);
-    const n = line.time.length, m = line.updates, R = settings.sigmaZ * settings.sigmaZ;
+    const n = line.time.length, m = line.updates, R = settings.sigma_z_m * settings.sigma_z_m;
     const columns = (names, length) => Object.fromEntries(names.split(" ").map((name) => [name, new Float64Array(length)]));
     const steps = { time: line.time, ...columns("p v p00 p01 p11", n), acceleration: mean, extra };
     const updates = columns("step time z nu s k0 k1 p v p00 p01 p11", m);

@@ -79,7 +79,7 @@ class Figures(Record, frozen=True):
     plots: dict[str, Plot]
 
 
-FIGURES = read_toml(__file__, "figures.toml", Figures)
+FIGURES = read_toml(__file__, Figures)
 
 
 def document_json(data: PageData) -> tuple[Any, dict[str, str]]:

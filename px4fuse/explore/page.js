@@ -11,13 +11,13 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ settings
   // `log`: ends of a logarithmic slider; a slider without `log` is linear. `likely`: maximum-likelihood estimate
   const SETTINGS = [
-    { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
+    { id: "sigma-a", key: "sigma_a_m_s2", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise", likely: () => likelyNow()[0] },
-    { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
+    { id: "sigma-z", key: "sigma_z_m", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => likelyNow()[1] },
-    { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
+    { id: "clock-offset", key: "clock_offset_s", title: "Time offset", unit: "s",
       hint: "added to timestamps", likely: () => flight.offset.likely },
-    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
+    { id: "dt", key: "dt_s", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
@@ -26,8 +26,8 @@ const Explore = (async () => {
   const round = (value, digits) => Number(value.toPrecision(digits));
   // set if the time offset cannot change
   const fixedReason = flight.offset.why;
-  const offsetLimits = fixedReason ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
-  const limits = (setting) => setting.key === "offset" ? offsetLimits : ranges[setting.id];
+  const offsetLimits = fixedReason ? [settings.clock_offset_s, settings.clock_offset_s] : [flight.offset.from, flight.offset.to];
+  const limits = (setting) => setting.key === "clock_offset_s" ? offsetLimits : ranges.settings[setting.key];
   const isWithinLimits = (setting, text) => {
     const [low, high] = limits(setting);
     return text !== "" && text >= low && text <= high;
@@ -61,7 +61,7 @@ const Explore = (async () => {
       show();
     });
     box.append(label, setting.number, setting.slider, ticks);
-    if (setting.key === "offset" && fixedReason) box.append(make("p", fixedReason, "note"));
+    if (setting.key === "clock_offset_s" && fixedReason) box.append(make("p", fixedReason, "note"));
     $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
@@ -90,17 +90,17 @@ const Explore = (async () => {
   const likelyNow = () => flight.likely[axisNow().noises] ?? [null, null];
 
   onClick("lesson", () => {
-    const { sigmaA, sigmaZ, dt } = ranges.lesson;
-    set({ sigmaA, sigmaZ, dt });
+    const { sigma_a_m_s2, sigma_z_m, dt_s } = ranges.lesson;
+    set({ sigma_a_m_s2, sigma_z_m, dt_s });
     showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
     const [sigmaA, sigmaZ] = likelyNow().map((value) => round(value, 3));
-    set({ sigmaA, sigmaZ, dt: flight.settings.dt });
+    set({ sigma_a_m_s2: sigmaA, sigma_z_m: sigmaZ, dt_s: flight.settings.dt_s });
     showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
   onClick("ekf2-r", () => {
-    set({ sigmaZ: round(axisNow().ekf2.r, 3) });
+    set({ sigma_z_m: round(axisNow().ekf2.r, 3) });
     showMessage("SIGMA_Z is set to the median of √R of EKF2.");
   });
 
@@ -272,7 +272,7 @@ const Explore = (async () => {
     }
     set({ ...flight.settings, ...changes });
   });
-  const isChanged = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
+  const isChanged = () => Object.keys(flight.settings).some((key) => settings[key] !== flight.settings[key]);
   const fixed = (key, unit) => (x) => x[key]?.toFixed(3).concat(unit);
   const percent = ({ outside }, digits) => outside === undefined ? undefined : `${(100 * outside).toFixed(digits)} %`;
   const ROWS = [
@@ -325,7 +325,7 @@ const Explore = (async () => {
     drawSource("steps", sawtooth, ["p", "sp"]);
     drawSource("updates", rows, ["x"]);
     if (isVisible("position")) {
-      drawSource("measured", { t: axis.time.map((t) => t + settings.offset), z: axis.z }, ["z"]);
+      drawSource("measured", { t: axis.time.map((t) => t + settings.clock_offset_s), z: axis.z }, ["z"]);
     }
     const expected = isVisible("error") ? reference(axis, steps.time) : null;
     if (expected !== null) {
@@ -387,9 +387,9 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ command
   function command() {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
-    const words = [settings.offset !== flight.settings.offset ? fixed : base];
+    const words = [settings.clock_offset_s !== flight.settings.clock_offset_s ? fixed : base];
     for (const setting of SETTINGS) {
-      const standard = setting.key !== "offset" ? lesson[setting.key] : fixedReason ? settings.offset : 0;
+      const standard = setting.key !== "clock_offset_s" ? lesson[setting.key] : fixedReason ? settings.clock_offset_s : 0;
       if (settings[setting.key] !== standard) words.push(`--${setting.id} ${round(settings[setting.key], 12)}`);
     }
     if (settings.input !== defaultInput || input !== null) words.push(`--input ${settings.input}`);

@@ -94,7 +94,7 @@ class MistakeTable(Record, frozen=True):
     mistakes: tuple[HiddenMistake, ...]
 
 
-_QUIZ = read_toml(__file__, "practice.toml", MistakeTable)
+_QUIZ = read_toml(__file__, MistakeTable)
 FAULT_CHOICES, HIDDEN_MISTAKES = _QUIZ.choices, _QUIZ.mistakes
 
 

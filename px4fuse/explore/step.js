@@ -40,7 +40,7 @@ const Step = (() => {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
     const [, , b00, b01, b11] = stateOf(s, i - 1), [p, v, p00, p01, p11] = state(run, { i, u, updated: false });
     const dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
-    const q = (settings.sigmaA ** 2 + s.extra[i - 1]) * settings.dt;
+    const q = (settings.sigma_a_m_s2 ** 2 + s.extra[i - 1]) * settings.dt_s;
     const prediction = [
       ["Previous state", `x⁺ = [${format(s.p[i - 1])} m, ${format(s.v[i - 1])} m/s]`],
       ["", `P⁺ = ${matrix(b00, b01, b11)}`],
@@ -52,7 +52,7 @@ const Step = (() => {
     ];
     if (u < 0) return [prediction, []];
     const update = [
-      ["Measurement", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(settings.sigmaZ ** 2, 5)} m²`],
+      ["Measurement", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(settings.sigma_z_m ** 2, 5)} m²`],
       ["Innovation", `ν = z − Hx⁻ = ${format(m.nu[u])} m`],
       ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`]];
     if (updated) {
@@ -159,7 +159,7 @@ const Step = (() => {
       const [band, line] = ["band", "measurement"].map((name) => plot.center.find((item) => item.name === name));
       band.visible = line.visible = isMeasured;
       if (isMeasured) {
-        [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
+        [band.left, band.right] = [z - 2 * settings.sigma_z_m, z + 2 * settings.sigma_z_m];
         line.location = z;
       }
       // the same scale for the whole run shows changes of the ellipse; only the first ellipses are larger

@@ -122,7 +122,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
     """Return the times of the last valid measurement before a span and the first one after it."""
-    time_s = analysis.lines[0].measurement_time_s
+    time_s = analysis.input_axes[0].measurement_time_s
     indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
 

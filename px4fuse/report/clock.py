@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
 from px4fuse.convention.correction import convention_faults
 from px4fuse.filter.time_offset import ClockOffset
@@ -38,7 +38,9 @@ def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     return not clock.is_determinable or any(finding.id in CLOCK_FINDINGS for finding in findings)
 
 
-def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
+def clock_advice(
+    comparison: PreparedComparison, clock: ClockOffset | Unavailable
+) -> dict[str, str]:
     """Return sentences on the time offset of the position source, and their labels as keys."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
@@ -84,7 +86,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     return advice
 
 
-def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
+def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, flown_ms: float) -> str:
     name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
     if ml_delay_ms is None:
         return f"{name} {flown_ms:g} ms agrees with the estimate."

@@ -297,7 +297,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map with the main axis to the right; without a main axis, north is up."""
     aisle_heading_deg = next(
-        (line.heading_deg for line in analysis.lines if line.name == AISLE), None
+        (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )
     heading_rad, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle_heading_deg is not None:

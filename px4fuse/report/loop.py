@@ -28,8 +28,8 @@ from px4fuse.report.style import (
 )
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
+from px4fuse.trajectory.graph.solver import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import Interval, Statistics
 

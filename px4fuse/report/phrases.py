@@ -12,18 +12,18 @@ from px4fuse.comparison.model import (
     Comparison,
     Difference,
     FilterSummary,
+    PreparedComparison,
     UntestedFilter,
 )
 from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.log import ClockMap
-from px4fuse.flight.model import Alignment, Columns, Truth, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -45,10 +45,11 @@ def format_settings(settings: Settings) -> str:
     offset_text = (
         f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     )
-    return (
-        f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
-        f"DT {settings.dt_s:g} s, input {settings.input}{offset_text}"
+    numbers = (
+        f"{SETTING_RANGES[name].label} {getattr(settings, name):g} {SETTING_RANGES[name].unit}"
+        for name in KF_NUMBERS
     )
+    return f"{', '.join(numbers)}, input {settings.input}{offset_text}"
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
@@ -176,7 +177,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 
 
 def tuning_advice(
-    comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
+    comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return the recommended actions after noise estimation, with their labels as keys."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)

@@ -7,7 +7,6 @@ import hashlib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from string import Template
 from typing import Annotated, Any, Literal, get_args
@@ -57,7 +56,7 @@ class FormChoices(Record, frozen=True):
     renamed: dict[str, str]
 
 
-_CHOICES = read_toml(__file__, "form.toml", FormChoices)
+_CHOICES = read_toml(__file__, FormChoices, "form.toml")
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
 # Units of the value of a correction (empty without a value), by name of the correction
@@ -69,14 +68,14 @@ Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
 VERDICTS = get_args(VerdictWord)[1:]
-RangeName = Literal["", "a", "b", "c", "d", "e"]
+ChoiceName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
 # Description of the accepted values of a text field of the answer form, by field name
 ACCEPTED_VALUES = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or an empty text with the times from_s and until_s',
     "ekf2_did": "a list of behaviours, each in quotes",
-    "predictions": "a letter from a to e in quotes",
+    "choices": "a letter from a to e in quotes",
     "log_sha256": "the SHA-256 of the log, which px4fuse answers writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
@@ -84,33 +83,31 @@ ACCEPTED_VALUES = {
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-# Names of the ranges from which the student chooses a prediction
-PREDICTION_RANGES: tuple[RangeName, ...] = get_args(RangeName)[1:]
-MAX_PREDICTIONS = 10
-PREDICTIONS_HEAD = """
-# Predictions: the same flight was simulated again with one change, and analysed with SIGMA_A 0.5
-# and SIGMA_Z 0.1. Give the letter of the range that contains the number along the main axis.
-# A wrong letter costs a quarter of the points of a right letter.
-[predictions]
+# Letters of the answers from which the student chooses
+CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
+MAX_CHOICES = 20
+CHOICES_HEAD = """
+# Figures: the picture of the same name (.png) shows flights with other faults, analysed with
+# SIGMA_A 0.5 and SIGMA_Z 0.1. The vehicle flies in the direction of the aisle in grey times. Give
+# the letter of the right answer. A wrong letter costs a quarter of the points of a right letter.
+[choices]
 """
 
 
-class Prediction(Record, frozen=True):
-    """Number of the flight simulated with one change: the student chooses one of five ranges.
+class Choice(Record, frozen=True):
+    """Question about a figure, with five answers: the student chooses one."""
 
-    ``quantity`` names the number and the change, ``limits`` are the four limits between the ranges.
-    """
+    question: str
+    options: tuple[str, ...]
 
-    quantity: str
-    limits: tuple[float, float, float, float]
+    def answer_text(self, letter: str) -> str:
+        """Return the text of an answer by its letter."""
+        return self.options[CHOICE_NAMES.index(letter)]
 
     @property
     def text(self) -> str:
-        first, *_, last = numbers = [f"{limit:.3g}" for limit in self.limits]
-        middle_ranges = [f"{low} to {high}" for low, high in pairwise(numbers)]
-        ranges = (f"below {first}", *middle_ranges, f"above {last}")
-        ranges_text = ", ".join(map(": ".join, zip(PREDICTION_RANGES, ranges, strict=True)))
-        return f"{self.quantity}; {ranges_text}"
+        options = map(": ".join, zip(CHOICE_NAMES, self.options, strict=True))
+        return "\n#     ".join([self.question, *options])
 
 
 class StudentMistake(Record, frozen=True):
@@ -157,8 +154,8 @@ class Answers(Record, frozen=True, kw_only=True):
         Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
         Answers to :func:`draw_questions`; for the gate, the numbers of the updates outside it.
-    predictions : tuple of str
-        Range that the student chose for each :class:`Prediction`; "" if left blank.
+    choices : tuple of str
+        Letter that the student chose for each :class:`Choice`; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -167,7 +164,7 @@ class Answers(Record, frozen=True, kw_only=True):
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
     quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
-    predictions: Annotated[tuple[RangeName, ...], Meta(max_length=MAX_PREDICTIONS)] = ()
+    choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
     def names_no_mistake(self) -> bool:
@@ -278,7 +275,7 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     if isinstance(invalid_value, dict):
         return f"mistake {number}: {reason}"
     accepted_text = ACCEPTED_VALUES.get(path_names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
-    if path_names[0] in ("quantities", "predictions"):
+    if path_names[0] in ("quantities", "choices"):
         field = f"{path_names[0][0]}{number}"
     place_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
     return f"{field}{place_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
@@ -287,26 +284,26 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     filled_form = _without_blanks(update_renamed_values(form))
     mistakes = filled_form.pop("mistake", ())
-    quantities, predictions = (
+    quantities, choices = (
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
-        for name in ("quantities", "predictions")
+        for name in ("quantities", "choices")
     )
     quantity_names = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
-    prediction_names = [f"p{number}" for number in range(1, MAX_PREDICTIONS + 1)]
+    choice_names = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     if unknown_fields := sorted(
         {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_names)
-        | predictions.keys() - set(prediction_names)
+        | choices.keys() - set(choice_names)
     ):
         raise ValueError(
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
             f"{', '.join(quantity_names)}"
         )
-    answered_names = prediction_names if predictions else ()
+    answered_names = choice_names if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(map(quantities.get, quantity_names)),
-        "predictions": tuple(predictions.get(name, "") for name in answered_names),
+        "choices": tuple(choices.get(name, "") for name in answered_names),
     }
 
 
@@ -372,7 +369,7 @@ def form_name(log_name: str) -> str:
     return f"{Path(log_name).stem}.answers.toml"
 
 
-def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] = ()) -> str:
+def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
     """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
     template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
@@ -394,8 +391,8 @@ def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] 
         panels=_format_block(_format_in_threes(PANELS)),
         questions="\n".join(questions),
     ) + "".join(
-        f'{PREDICTIONS_HEAD * (number == 1)}# {prediction.text}\np{number} = ""\n'
-        for number, prediction in enumerate(predictions, start=1)
+        f'{CHOICES_HEAD * (number == 1)}# {choice.text}\nc{number} = ""\n'
+        for number, choice in enumerate(choices, start=1)
     )
 
 
@@ -423,9 +420,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    for number, range_name in enumerate(answers.predictions, start=1):
-        if range_name:
-            yield f"Prediction p{number}", range_name
+    for number, letter in enumerate(answers.choices, start=1):
+        if letter:
+            yield f"Answer c{number} about the figures", letter
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

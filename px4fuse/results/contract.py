@@ -27,14 +27,12 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.flight.log import ClockMap, InputFile, LogInfo
-from px4fuse.flight.model import Alignment
-from px4fuse.flight.position_source import DataPath, PositionKind
+from px4fuse.flight.model import Alignment, ClockMap, DataPath, InputFile, LogInfo, PositionKind
 from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import Graph
+from px4fuse.trajectory.graph.solver import Graph
 from px4fuse.trajectory.model import Track
 
 COMPARISON_SCHEMA = "px4fuse-results"
