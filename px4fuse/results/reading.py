@@ -18,16 +18,16 @@ from px4fuse.results.model import SCHEMA_VERSION
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
-class _Schema(msgspec.Struct):
+class _Schema(msgspec.Struct, frozen=True):
     name: str
     version: str
 
 
-class _Writer(msgspec.Struct):
+class _Writer(msgspec.Struct, frozen=True):
     px4fuse: str = "of that schema version"
 
 
-class _Head(msgspec.Struct):
+class _Head(msgspec.Struct, frozen=True):
     """Fields that results of all versions of the schema contain."""
 
     schema: _Schema
