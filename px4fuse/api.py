@@ -10,7 +10,7 @@ from msgspec import structs
 from px4fuse import request
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
-from px4fuse.core.notebook_display import display_html
+from px4fuse.core.record import display_html
 from px4fuse.core.writing import write_all
 from px4fuse.diagnose import diagnose, require_available, run_what_if
 from px4fuse.ekf2 import whatif

@@ -48,8 +48,7 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
-from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest

@@ -21,8 +21,7 @@ from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import NO_INVALID_ROWS, RECEIVED, Columns, Ekf2, FusionRecord, Unavailable
 
 T = TypeVar("T")
 

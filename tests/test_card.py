@@ -19,7 +19,7 @@ from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest

@@ -164,7 +164,7 @@ def test_extension_guide_names_only_existing_files() -> None:
         "cli/options.py": ["def request_option"],
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
-        "flight/position_source.py": ["ORIGINS"],
+        "flight/model.py": ["ORIGINS"],
         "report/pdf.py": ["PAGES"],
         "cli/__init__.py": ["COMMANDS"],
     }.items():

@@ -28,8 +28,7 @@ from px4fuse.ekf2.replay import inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
-from px4fuse.flight.model import Columns, Flight, FusionRecord, PositionTrack, Unavailable
-from px4fuse.flight.position_source import GNSS
+from px4fuse.flight.model import GNSS, Columns, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import reconstruct_fixes
 from px4fuse.report.clock import clock_advice

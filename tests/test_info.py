@@ -17,9 +17,7 @@ from px4fuse.cli import cli
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight.log import Dropout, Sender
-from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.flight.position_source import GNSS
+from px4fuse.flight.model import GNSS, Dropout, Flight, Sender, Unavailable
 from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inventory, to_json_dict
 from px4fuse.readers import read_log
 

@@ -49,8 +49,7 @@ from time_limit import time_limit
 
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
-from px4fuse.flight.position_source import MOTION_CAPTURE, RECEIVED
+from px4fuse.flight.model import MOTION_CAPTURE, RECEIVED, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.info.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout

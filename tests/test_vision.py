@@ -29,8 +29,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight.model import AidLog, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, AidLog, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.report.difference_page import format_agreement
 from px4fuse.report.whatif import statistic_rows
 from px4fuse.request import WhatIfRequest

@@ -7,8 +7,7 @@ from px4fuse.convention.axes import UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
-from px4fuse.flight.model import Columns, Flight, PositionTrack, time_index
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import POSITION_FILE, Columns, Flight, PositionTrack, time_index
 
 # Maximum time span (s) of file and log for explain_mismatch, which takes 1 s per hour
 MAX_SPAN_S = 7200.0

@@ -4,7 +4,10 @@ from collections import Counter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.random_assignment import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
+from px4fuse.classroom.assignment.random_assignment import (
+    EASIEST_DIFFICULTY,
+    UNDETECTABLE_DIFFICULTY,
+)
 from px4fuse.classroom.grading.grade import GradeOutcome
 from px4fuse.core.text import count_noun, one_line
 from px4fuse.errors import to_one_line
@@ -26,7 +29,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
         "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
         "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
+        f"{EASIEST_DIFFICULTY:g} to {UNDETECTABLE_DIFFICULTY:g}. The difficulty is the smallest "
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",

@@ -211,7 +211,7 @@ def _solve_graph(
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results
-    from px4fuse.trajectory.graph.analysis import analyse_graph
+    from px4fuse.trajectory.graph.solver import analyse_graph
 
     path, track = split_path_and_part(str(source))
     if track is not None:

@@ -8,7 +8,6 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import (
     NOT_WRITTEN,
     Count,
@@ -21,6 +20,7 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
     Vector,
+    one_line_repr,
 )
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio

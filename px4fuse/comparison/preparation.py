@@ -17,6 +17,7 @@ from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segm
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
+    POSITION_FILE,
     Columns,
     Ekf2,
     Flight,
@@ -25,7 +26,6 @@ from px4fuse.flight.model import (
     Unavailable,
     join_flights,
 )
-from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,

@@ -53,7 +53,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
-from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
+from px4fuse.ekf2.replay import Ekf2Replay, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -70,6 +70,8 @@ from px4fuse.flight.model import Columns, Unavailable
 
 # Maximum mean NIS of innovations without visible errors
 MAX_NORMAL_NIS = 1.5
+INNOVATIONS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
+INNOVATION_VARIANCES = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
@@ -405,7 +407,7 @@ def _replay_statistics(
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = ekf2_updates[inside_spans(ekf2_updates.index, compared_s)]
-    innovation_variance_m2 = weighted_sum(ekf2_updates, UPDATE_COLUMNS[2:4], direction_cosines**2)
+    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCES, direction_cosines**2)
     prior_m2 = innovation_variance_m2 - weighted_sum(
         ekf2_updates, OBSERVATION_VARIANCES, direction_cosines**2
     )
@@ -423,7 +425,7 @@ def _replay_statistics(
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = logged_state[inside_spans(logged_state.index, compared_s)]
     return _run_statistics(
-        weighted_sum(ekf2_updates, UPDATE_COLUMNS[:2], direction_cosines),
+        weighted_sum(ekf2_updates, INNOVATIONS, direction_cosines),
         innovation_variance_m2,
         error_statistics(published, variance_by_time, axis_result.truth),
         difference(axis_result.replay, compared_track),

@@ -6,7 +6,7 @@ from typing import Any
 
 from px4fuse.core.record import read_toml
 
-_UNITS = read_toml(__file__, "units.toml", dict[str, dict[str, Any]])
+_UNITS = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNITS["names"]
 # Factors that convert typed units to a unit of px4fuse, by the unit of px4fuse

@@ -38,6 +38,7 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
+    POSITION_FILE,
     Columns,
     Ekf2,
     Flight,
@@ -47,7 +48,6 @@ from px4fuse.flight.model import (
     reset_times_s,
     step_values_at,
 )
-from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
@@ -159,11 +159,26 @@ class FusionRules:
     stop_s: float
     reset_s: float
     max_resets: int
-    min_bias_variance: float | None
-    uses_delay_as_horizon: bool
+    min_bias_variance: float | None = None
+    uses_delay_as_horizon: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
     bad_acceleration_s: float = 3.0
+
+
+# Rules of EKF2 v1.14 and later for external vision: EV_MAX_INTERVAL (ev_control.cpp),
+# no_aid_timeout_max and reset_timeout_max (common.h)
+VISION_RULES = FusionRules(start_interval_s=0.2, stop_s=0.4, reset_s=1.0, max_resets=5)
+# Rules of EKF2 v1.16 for GNSS: a reset doubles the variance of the sample
+# (resetHorizontalPositionTo, gps_control.cpp)
+GNSS_RULES = FusionRules(
+    start_interval_s=np.inf,
+    stop_s=np.inf,
+    reset_s=7.0,
+    max_resets=UNLIMITED_RESETS,
+    reset_variance_factor=2.0,
+    resets_velocity=True,
+)
 
 
 @dataclass(frozen=True)
@@ -362,30 +377,20 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    min_bias_variance = 5e-8 / step_s**2 if fusion_record.stores_bias_increments else None
-    is_horizon_from_delay = "EKF2_DELAY_MAX" not in fusion_record.parameters
+    rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
-        # gps_control.cpp)
-        reset_variance_factor = 2.0 if fusion_record.stores_latitude else 1.0
         # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
-        resets_together = GNSS_MODE not in fusion_record.parameters
-        return FusionRules(
-            np.inf,
-            np.inf,
-            7.0,
-            UNLIMITED_RESETS,
-            min_bias_variance,
-            is_horizon_from_delay,
-            reset_variance_factor,
-            resets_together,
-            bad_acceleration_s=3.0 if fusion_record.stores_latitude else 10.0,  # BADACC_PROBATION
-        )
-    # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
-    limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
-    if not uses_aid_mask(fusion_record.parameters):
-        limits = (0.2, 0.4, 1.0, 5)
-    return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
+        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE not in parameters)
+        if not fusion_record.stores_latitude:
+            # bad_acceleration_s: BADACC_PROBATION
+            rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_s=10.0)
+    elif uses_aid_mask(parameters):
+        rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
+    return replace(
+        rules,
+        min_bias_variance=5e-8 / step_s**2 if fusion_record.stores_bias_increments else None,
+        uses_delay_as_horizon="EKF2_DELAY_MAX" not in parameters,
+    )
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:

@@ -1,7 +1,7 @@
 """Result of an EKF2 replay, and its agreement with the log."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, innovation_topic, matching_sample
 from px4fuse.ekf2.replay_segments import SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_HGT, GNSS_VEL, MAG
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
 from px4fuse.flight.model import (
     AXIS_NAMES,
     AidLog,
@@ -41,27 +41,6 @@ from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
-UPDATE_COLUMNS = [
-    "innovation_north_m",
-    "innovation_east_m",
-    "innovation_variance_north_m2",
-    "innovation_variance_east_m2",
-    "rejected",
-    "fused",
-    "reset",
-    "position_variance_north_m2",
-    "position_variance_east_m2",
-    "velocity_variance_north_m2_s2",
-    "velocity_variance_east_m2_s2",
-    "observation_variance_north_m2",
-    "observation_variance_east_m2",
-    "fused_at_s",
-]
-VELOCITY_UPDATE_COLUMNS = [
-    *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
-    *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
-    "velocity_rejected",
-]
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
@@ -194,9 +173,9 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     late, lost : int
         Number of samples that were fused late, and that were too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
-        Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
+        See :func:`~px4fuse.ekf2.replay_segments.update_table`.
     other_aid_updates : mapping from PX4's name to DataFrame
-        Updates with GNSS height, barometer, and vision in addition to GNSS.
+        Updates with GNSS velocity (m/s), GNSS height, barometer, and vision in addition to GNSS.
     flow_only_spans_s : tuple of (float, float)
         Times in which optical flow was the only horizontal aiding source.
     delayed, published : DataFrame
@@ -255,9 +234,12 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "Record vehicle_local_position during the whole flight.",
         )
     aid = replayed_aid(ekf2)
-    is_own_topic = innovation_topic(aid) in ekf2.innovation_topics
     position_agreement = _compare_innovations(
-        ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
+        ekf2,
+        replay,
+        replay.updates,
+        logged_innovations(ekf2),
+        innovation_topic(aid) in ekf2.innovation_topics,
     )
     if isinstance(position_agreement, str):
         return Unavailable(
@@ -270,9 +252,6 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         position_agreement.axes, rejected_in_log, rejected_in_replay
     )
     agreements, omitted_aids = _other_agreements(ekf2, replay)
-    velocity_agreement = _compare_velocity(ekf2, replay, is_own_topic)
-    if velocity_agreement == CONSTANT_INNOVATIONS:
-        omitted_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
@@ -287,7 +266,6 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     return Agreement(
         north=position_agreement.axes["north"],
         east=position_agreement.axes["east"],
-        gnss_vel={} if isinstance(velocity_agreement, str) else velocity_agreement.axes,
         **(agreements | {aid.name: position_agreement.axes}),
         doubtful=omitted_aids,
         samples=len(position_agreement.logged),
@@ -307,7 +285,6 @@ def _compare_innovations(
     replay: Ekf2Replay,
     updates: pd.DataFrame,
     logged: pd.DataFrame,
-    axes: Sequence[AxisName],
     is_own_topic: bool,
 ) -> _ComparedInnovations | str:
     """Compare innovations in the evaluated times, or return the reason why this is impossible."""
@@ -321,6 +298,7 @@ def _compare_innovations(
             f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
             f"(at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
+    axes = axes_of(updates)
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
         return CONSTANT_INNOVATIONS
@@ -361,42 +339,13 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     return float(np.degrees(rms(difference_rad)))
 
 
-def _compare_velocity(
-    ekf2: Ekf2, replay: Ekf2Replay, is_own_topic: bool
-) -> _ComparedInnovations | str:
-    aid_log = ekf2.aids.get(GNSS_VEL.name)
-    if aid_log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
-        return "GNSS velocity is not fused or not logged"
-    # give the velocity columns the names of position columns
-    renamed_columns: dict[str, str] = {}
-    for axis in AXIS_NAMES:
-        nu = f"innovation_{axis}_m"
-        S = f"innovation_variance_{axis}_m2"
-        renamed_columns |= {
-            f"{nu}_s": nu,
-            f"{S}_s2": S,
-            f"innovation_{axis}": nu,
-            f"variance_{axis}": S,
-        }
-    return _compare_innovations(
-        ekf2,
-        replay,
-        replay.updates.filter([*VELOCITY_UPDATE_COLUMNS, "fused_at_s"]).rename(
-            columns=renamed_columns
-        ),
-        aid_log.samples.rename(columns=renamed_columns),
-        # without height fusion the replay uses the logged EKF2 height
-        AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL,
-        is_own_topic,
-    )
-
-
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of heights and of vision in addition to GNSS, and each disagreement."""
+    """Return the agreement of the other aiding sources, and the reason of each disagreement."""
     agreements: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
-        aid_log = ekf2.aids[name]
+        if (aid_log := ekf2.aids.get(name)) is None:
+            continue
         # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
@@ -406,14 +355,14 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             replay,
             matched_updates,
             logged_aid_innovations(name, aid_log),
-            axes_of(updates),
             innovation_topic(AIDS[name]) in aid_log.topics,
         )
         if isinstance(compared, str):
-            omitted_aids[name] = compared
-            continue
-        agreements[name] = compared.axes
-        is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good, reason = name == GNSS_VEL.name and compared != CONSTANT_INNOVATIONS, compared
+        else:
+            agreements[name] = compared.axes
+            is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good |= name == GNSS_VEL.name
         if not is_good:
             omitted_aids[name] = reason
     return agreements, omitted_aids

@@ -17,7 +17,16 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
+from px4fuse.flight.model import (
+    BAD_ACCELERATION,
+    AxisName,
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    Unavailable,
+    time_index,
+)
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -92,6 +101,9 @@ class SensorSamples:
         R of one sample; 0 if R is a parameter.
     gate : float
         Innovation gate in √S; infinite if the gate is a parameter.
+    state_rows : tuple of slice
+        State (NED vector) that the sensor measures in the body frame and, optionally, state (body
+        frame) that is added to the measurement.
     """
 
     step: IntArray
@@ -100,6 +112,7 @@ class SensorSamples:
     sample_count: Array
     noise: Array
     gate: float = np.inf
+    state_rows: tuple[slice, ...] = (EARTH_FIELD, BODY_FIELD)
 
 
 @dataclass(frozen=True)
@@ -271,6 +284,40 @@ def samples_by_event(
     return samples
 
 
+def update_table(
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+) -> pd.DataFrame:
+    """Return the updates with one aiding source, in the order of fusion, at measurement times.
+
+    Parameters
+    ----------
+    update_log : ndarray, shape (E, k, ...)
+        For k samples of each event: ν and S along each axis, 1 for a sample that was rejected,
+        fused, or used for a reset, position variance after the update and R along each axis (the
+        last quantities are optional). NaN without a sample.
+    measured_at_s : ndarray, shape (E, k)
+    end_s : ndarray, shape (E,)
+        Time of each event.
+    axes : sequence of str
+    """
+    has_innovation = np.isfinite(update_log[..., 0])
+    columns = [
+        *(f"innovation_{axis}_m" for axis in axes),
+        *(f"innovation_variance_{axis}_m2" for axis in axes),
+        "rejected",
+        "fused",
+        "reset",
+        *(f"position_variance_{axis}_m2" for axis in axes),
+        *(f"observation_variance_{axis}_m2" for axis in axes),
+    ]
+    updates = pd.DataFrame(
+        update_log[has_innovation],
+        time_index(measured_at_s[has_innovation]),
+        columns[: update_log.shape[-1]],
+    )
+    return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
+
+
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
     """Pad the arrays of :func:`samples_by_event` to the same number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
@@ -313,6 +360,11 @@ def find_replay_segments(
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cut_times_s += [change.time_s for change in parameter_changes]
+
+    def make_segment(start_row: int, end_s: float) -> ReplaySegment:
+        segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
+        return _with_gnss_model(segment, imu, ekf2, fusion_record) if is_gnss else segment
+
     segments = []
     for low_s, high_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
         fused_inside = fused_s[(fused_s >= low_s) & (fused_s <= high_s)]
@@ -335,19 +387,17 @@ def find_replay_segments(
         is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high_s)
         if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
             continue
-        segment_inputs = imu, attitude, ekf2, fusion_record
         changed = {
             change.name: change.after for change in parameter_changes if change.time_s <= low_s
         }
-        make_segment = _make_gnss_segment if is_gnss else _make_segment
-        segment = make_segment(*segment_inputs, start_row, high_s)
+        segment = make_segment(start_row, high_s)
         history_row = int(
             np.searchsorted(
                 state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
             )
         )
         if history_row < start_row:
-            history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
+            history = make_segment(history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
         if field_span and field_span[0] <= state_times_s[start_row] and high_s <= field_span[1]:
             segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
@@ -355,23 +405,17 @@ def find_replay_segments(
     return tuple(segments)
 
 
-def _make_gnss_segment(
-    imu: pd.DataFrame,
-    attitude: pd.DataFrame,
-    ekf2: Ekf2,
-    fusion_record: FusionRecord,
-    start_row: int,
-    end_s: float,
+def _with_gnss_model(
+    segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Make a segment with earth rotation, positions in EKF2's metres, and bad accelerations."""
-    segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
+    """Add earth rotation, positions in EKF2's metres, and bad accelerations to a segment."""
     metres_per_metre = ekf2_metres_per_metre(fusion_record)
     initial_state = segment.state.copy()
     initial_state[POSITION] *= metres_per_metre
     earth_rotation_rad = earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
-    start_s, end_s = segment.time_s[[0, -1]]
-    velocity_down_m_s = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
-    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity_down_m_s)[0]
+    start_s, end_s = span_s = segment.time_s[[0, -1]]
+    velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
+    velocity_error = segment.imu_velocity_m_s[-1, 2] - velocity_change_m_s
     return replace(
         segment,
         state=initial_state,

@@ -25,7 +25,7 @@ from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
+from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
@@ -47,6 +47,8 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "rejections and resets"
 OUTPUT = "output predictor"
+# Steps of further aiding sources of the position
+FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
 # Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
 STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
@@ -271,46 +273,42 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
-    replayed_aids = modelled_aids(inputs)
-    other_aids = [name for name in (FLOW.name, EV_POS.name) if name in replayed_aids[1:]]
+    replayed_aids = modelled_aids(inputs)[1:]
+    further_steps = {aid: step for aid, step in FURTHER_STEPS.items() if aid in replayed_aids}
+    further_aids = [*further_steps]
     kf_configuration = FilterConfiguration(
         kf_parameters,
         estimates_biases=False,
         estimates_attitude=False,
-        fuses_velocity=False,
         uses_reported_noise=False,
         has_gate=False,
-        without=dict.fromkeys((MAG.name, *other_aids), 0.0),
+        fuses_velocity=False,
+        without=dict.fromkeys((MAG.name, *further_aids), 0.0),
     )
+    noise_configuration = replace(
+        kf_configuration, settings=kf_process_noise, uses_reported_noise=True
+    )
+    process_configuration = replace(
+        noise_configuration, settings=logged_settings, estimates_biases=True
+    )
+    configuration = replace(process_configuration, estimates_attitude=True)
     configurations = {
         SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
         TIMESTAMPS: kf_configuration,
-        NOISE: (
-            noise_configuration := replace(
-                kf_configuration, settings=kf_process_noise, uses_reported_noise=True
-            )
-        ),
+        NOISE: noise_configuration,
         BIASES: replace(noise_configuration, estimates_biases=True),
-        PROCESS: replace(noise_configuration, settings=logged_settings, estimates_biases=True),
-        ATTITUDE: (
-            configuration := replace(
-                noise_configuration,
-                settings=logged_settings,
-                estimates_biases=True,
-                estimates_attitude=True,
-            )
-        ),
+        PROCESS: process_configuration,
+        ATTITUDE: configuration,
     }
     if MAG.name in replayed_aids:
         configurations[FIELD_STEP] = configuration = replace(
-            configuration, without=dict.fromkeys(other_aids, 0.0)
+            configuration, without=dict.fromkeys(further_aids, 0.0)
         )
-    if inputs.received.velocity_m_s is not None:
+    if GNSS_VEL.name in replayed_aids:
         configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
-    for insertion_index, name in enumerate(other_aids, start=1):
-        step = FLOW_STEP if name == FLOW.name else VISION_STEP
+    for next_index, step in enumerate(further_steps.values(), start=1):
         configurations[step] = configuration = replace(
-            configuration, without=dict.fromkeys(other_aids[insertion_index:], 0.0)
+            configuration, without=dict.fromkeys(further_aids[next_index:], 0.0)
         )
     return configurations | {GATE: FilterConfiguration(logged_settings, uses_logged_decisions=True)}
 

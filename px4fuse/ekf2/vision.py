@@ -21,8 +21,12 @@ from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
-from px4fuse.ekf2.replay import UPDATE_COLUMNS
-from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_event
+from px4fuse.ekf2.replay_segments import (
+    ReplaySegment,
+    pad_samples,
+    samples_by_event,
+    update_table,
+)
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
@@ -89,7 +93,7 @@ class VisionFilter:
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        The first seven of :data:`UPDATE_COLUMNS` for each sample; NaN without an innovation.
+        Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for each sample.
     position_reset_m : ndarray, shape (E, S, 2)
         Change of the position by a reset at each event, north and east.
     fused_s : ndarray, shape (S,)
@@ -134,19 +138,11 @@ class VisionFilter:
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the vision updates of one filter configuration, in the order of fusion.
-
-        The index is the time of measurement; ``end_s`` is the time of each event.
-        """
-        update_log = self.update_log[..., configuration_index]
+        """Return the updates of one filter configuration; ``end_s`` is the time of each event."""
         measured_at_s = self.measured_at_s[..., configuration_index].T
-        has_innovation = np.isfinite(update_log[:, :, 0])
-        index = pd.Index(measured_at_s[has_innovation], name="time_s")
-        updates = pd.DataFrame(
-            update_log[has_innovation], index, UPDATE_COLUMNS[: update_log.shape[-1]]
+        return update_table(
+            self.update_log[..., configuration_index], measured_at_s, end_s, ["north", "east"]
         )
-        event, _ = np.nonzero(has_innovation)
-        return updates.assign(fused_at_s=end_s[event])
 
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
         """Fuse the vision samples of one event.

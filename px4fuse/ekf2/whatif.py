@@ -12,8 +12,8 @@ import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Share
+from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
+from px4fuse.ekf2.heights import SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -62,6 +62,7 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Take the height from the log (vehicle_local_position).",
 )
+HEIGHT_NAMES = {aid.name for aid in SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
@@ -391,9 +392,6 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         resets=int(reset_count),
         late=replay.late,
         lost=replay.lost,
-        velocity_rejected_fraction=_mean_rejected(
-            evaluated_updates, "velocity_rejected", evaluated_s
-        ),
     )
 
 
@@ -420,7 +418,9 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     assert isinstance(flight.attitude, pd.DataFrame)
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
-        name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates
+        name: logged_aid_innovations(name, ekf2.aids[name])
+        for name in replay.other_aid_updates
+        if name in ekf2.aids
     }
     return _make_summary(
         flight,
@@ -434,18 +434,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         changed={},
         longest_without_fusion_s=longest_gap_s,
         resets=len(reset_times_s),
-        velocity_rejected_fraction=(
-            _mean_rejected(ekf2.aids[GNSS_VEL.name].samples, "rejected", evaluated_s)
-            if "velocity_rejected" in replay.updates and GNSS_VEL.name in ekf2.aids
-            else None
-        ),
     )
-
-
-def _mean_rejected(samples: pd.DataFrame, column: str, evaluated_s: Spans) -> float | None:
-    """Return the fraction of rejected samples in the evaluated times; None without samples."""
-    is_rejected = samples.loc[inside_spans(samples.index, evaluated_s)].get(column)
-    return None if is_rejected is None or is_rejected.empty else float(is_rejected.mean())
 
 
 def _make_summary(
@@ -490,15 +479,17 @@ def _make_summary(
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
-    heights = {
+    aids = {
         name: _summarise_aid(evaluated, evaluated_s)
         for name, updates in other_aid_updates.items()
         if len(evaluated := updates[inside_spans(updates.index, evaluated_s)])
     }
-    if vision := heights.pop(EV_POS.name, None):
+    if velocity := aids.pop(GNSS_VEL.name, None):
+        more["velocity_rejected_fraction"] = velocity.rejected_fraction
+    if vision := aids.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
-    if other_aid_updates.keys() - {EV_POS.name}:
-        more["heights"] = heights
+    if other_aid_updates.keys() & HEIGHT_NAMES:
+        more["heights"] = aids
         more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
@@ -565,7 +556,7 @@ def _deviation_note(
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
-    height_aids = {*model.baseline_replay.other_aid_updates} - {EV_POS.name}
+    height_aids = HEIGHT_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     height_note = (
         f". The published height differs by at most {down_difference_m.max():.3g} m"

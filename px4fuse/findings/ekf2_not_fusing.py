@@ -22,8 +22,14 @@ from px4fuse.findings.model import (
     spans_with_value,
     warning,
 )
-from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_phrase
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    positions_phrase,
+)
 
 # Fraction of the time with fusion of the source by EKF2, below which the severity is error
 MIN_FUSED_FRACTION_ERROR = 0.5

@@ -4,8 +4,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import Unavailable, positions_phrase
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, Unavailable, positions_phrase
 
 RECEIVED_TOPIC = "vehicle_visual_odometry"
 # Bits 0 and 7 of SDLOG_PROFILE: default topics, and external vision (logged_topics.cpp)

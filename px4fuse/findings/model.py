@@ -13,8 +13,7 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionTrack
-from px4fuse.flight.position_source import PositionKind
+from px4fuse.flight.model import PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record, frozen=True):
@@ -48,7 +47,7 @@ class CatalogueEntry(Record, frozen=True):
 
 # All findings by id; findings of equal severity are listed in this order
 CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
-    __file__, "catalogue.toml", dict[str, CatalogueEntry]
+    __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
@@ -93,7 +92,7 @@ class SourceWords(Record, frozen=True):
     errors: str
 
 
-_WORDS_BY_KIND = read_toml(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+_WORDS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
 SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
     kind: SourceWords(**(_WORDS_BY_KIND["unknown"] | words))
     for kind, words in _WORDS_BY_KIND.items()

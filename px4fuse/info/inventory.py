@@ -24,8 +24,15 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD, Stream
-from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Unavailable, sample_rate
+from px4fuse.flight.model import (
+    DIAGNOSIS_WITHHELD,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Stream,
+    Unavailable,
+    sample_rate,
+)
 from px4fuse.info.tables import NO_POSITION, list_missing_data
 from px4fuse.request import ComparisonRequest, with_options
 

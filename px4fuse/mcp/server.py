@@ -47,7 +47,7 @@ ParseArguments = Callable[[Mapping[str, Any]], tuple[list[str], list[Path]]]
 
 
 # Title and text of each prompt, by its name
-PROMPTS = read_toml(__file__, "prompts.toml", dict[str, dict[str, str]])
+PROMPTS = read_toml(__file__, dict[str, dict[str, str]], "prompts.toml")
 
 
 class Server(MCPServer[Any]):

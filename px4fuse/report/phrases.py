@@ -23,8 +23,7 @@ from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.log import ClockMap
-from px4fuse.flight.model import Alignment, Columns, Truth, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student

@@ -28,7 +28,7 @@ from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import Graph
+from px4fuse.trajectory.graph.solver import Graph
 
 
 def results(

@@ -291,8 +291,7 @@ def _aid_source_topic(
         "innovation_rejected": decisions[0],
         "fused": decisions[1],
     }
-    name = f"estimator_aid_src_{aid.name}"
-    return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
+    return topic(f"estimator_aid_src_{aid.name}", fields)
 
 
 def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:

@@ -60,14 +60,13 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             f"{describe_right_answer(mistake)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )
-    given_ranges = dict(enumerate(form.predictions))
-    for index, (prediction, right_range) in enumerate(truth.predictions):
-        given_range = given_ranges.get(index) or "none"
+    given_letters = dict(enumerate(form.choices))
+    for index, (choice, right_letter) in enumerate(truth.choices):
+        given_letter = given_letters.get(index)
+        given_text = choice.answer_text(given_letter) if given_letter else "none"
         yield (
-            f"For the {prediction.quantity} you gave range {given_range}. Is this more or less "
-            "than in your flight, and why?",
-            f"Range {right_range} is right. The reason names what the change does to the "
-            "innovations, and to R or Q.",
+            f"{choice.question}: your answer is: {given_text}. Explain it with the figure.",
+            f"Right: {choice.answer_text(right_letter)}.",
         )
     for filter_name, given_verdict, true_verdict in (
         ("KF", form.verdict_kf, truth.kf),
