@@ -50,9 +50,9 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
         ],
         "likely": _likely_noises(analysis),
         "events": {
-            "gap": list(events.gaps),
-            "dropout": list(events.dropouts),
-            "ground": list(events.ground),
+            "gap": events.gaps,
+            "dropout": events.dropouts,
+            "ground": events.ground,
             "reset": list(events.resets_s),
         },
         "command": _command_data(request, analysis),
@@ -78,7 +78,7 @@ def ranges() -> PageData:
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
         "bands": CONSISTENT_RATIOS,
-        "ends": list(RATIO_AXIS_ENDS),
+        "ends": RATIO_AXIS_ENDS,
         "marks": MARK_PATHS,
     }
 
@@ -111,14 +111,13 @@ def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     time_s = acceleration.time_s
     gap_starts = np.flatnonzero(imu_gaps(time_s))
     gap_edges_s = np.stack([time_s[gap_starts], time_s[gap_starts + 1]], 1)
-    cumulative_gap_s = np.cumsum(gap_edges_s[:, 1] - gap_edges_s[:, 0])
+    gap_sum_s = np.cumsum(np.diff(gap_edges_s, prepend=gap_edges_s[:, :1]))
     return {
         "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_edges_s.ravel().tolist(),
-        "gapSum": np.stack([np.concatenate([[0.0], cumulative_gap_s])[:-1], cumulative_gap_s], 1)
-        .ravel()
-        .tolist(),
+        # cumulative duration of the gaps at these edges
+        "gapSum": gap_sum_s.tolist(),
     }
 
 
@@ -228,8 +227,6 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
         )
         variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
-    else:
-        ekf2_data["why"] = result.ekf2_innovations.reason
     return ekf2_data
 
 

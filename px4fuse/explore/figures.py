@@ -4,12 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from bokeh.document import Document
-from bokeh.models import (
-    ColumnDataSource,
-    FactorRange,
-    HoverTool,
-    Range1d,
-)
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
@@ -110,10 +105,7 @@ def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
     document = Document()
     time_range = _axis_range("time")
     plots = _make_plots(data, time_range)
-    plots |= {
-        "strip": _event_plot(data, time_range),
-        "step": _phase_plot(),
-    }
+    plots |= {"strip": _event_plot(data, time_range), "step": _phase_plot()}
     with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
@@ -252,8 +244,7 @@ def _event_plot(data: PageData, time_range: Range1d) -> Any:
         right="right",
         height=0.55,
         source=source,
-        fill_color="#7d8894",
-        line_color="#7d8894",
+        color="#7d8894",
         name="event",
     )
     _add_cursor(plot_figure, name="cursor")

@@ -17,6 +17,7 @@ from msgspec import structs
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
 from px4fuse.core.record import Record, read_toml
+from px4fuse.core.text import capitalise_first
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
@@ -170,8 +171,8 @@ def practice_text(
         data, data_element = _flight_data(practice_flight, number)
         data_elements.append(data_element)
     return page_text(
-        "\n".join(data_elements),
         data,
+        data_scripts="\n".join(data_elements),
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -239,6 +240,6 @@ def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Car
     return structs.replace(
         card,
         severity="warning",
-        headline=fault_text[0].upper() + fault_text[1:],
+        headline=capitalise_first(fault_text),
         do_this=("None of the automatic checks finds this fault. Compare the plots.",),
     )

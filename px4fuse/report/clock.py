@@ -126,7 +126,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         "so it is wider than the curve shows."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
-    draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
+    draw_curve(page.panel(title, CURVE_HEIGHT, caption=curve_sentence, above=14.0), clock)
     yield page
 
 

@@ -50,7 +50,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     result = analysis.main
     start_s, end_s = zoom_span_s = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.panel(title, zoom_sentence(result), ZOOM_HEIGHT)
+    axes = page.panel(title, ZOOM_HEIGHT, caption=zoom_sentence(result))
     _draw_sawtooth(axes, result, zoom_span_s)
     update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(

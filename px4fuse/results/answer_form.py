@@ -7,7 +7,6 @@ import hashlib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Annotated, Any, Literal, get_args
@@ -17,7 +16,7 @@ from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, read_toml
-from px4fuse.core.text import one_line
+from px4fuse.core.text import convert_nested, one_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -64,18 +63,16 @@ MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHO
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 # Verdict on a filter without innovations
 NOT_AVAILABLE = "not available"
-VERDICTS = ("consistent", "overconfident", "underconfident", NOT_AVAILABLE)
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
+VERDICTS = get_args(VerdictWord)[1:]
 ChoiceName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
 # Description of the accepted values of a text field of the answer form, by field name
 ACCEPTED_VALUES = {
-    **dict.fromkeys(
-        ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
-    ),
+    **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or an empty text with the times from_s and until_s',
     "ekf2_did": "a list of behaviours, each in quotes",
     "choices": "a letter from a to e in quotes",
@@ -87,7 +84,7 @@ QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | 
 
 
 # Letters of the answers from which the student chooses
-CHOICE_NAMES: tuple[ChoiceName, ...] = ("a", "b", "c", "d", "e")
+CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
 MAX_CHOICES = 20
 CHOICES_HEAD = """
 # Figures: the picture of the same name (.png) shows flights with other faults, analysed with
@@ -229,8 +226,8 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    duration_or_gate_limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_or_gate = draw_between(*duration_or_gate_limits, 1)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
+    duration_or_gate = draw_between(*limits, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
         FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
@@ -311,14 +308,7 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
 
 def update_renamed_values(value: Any) -> Any:
     """Replace names and values of answer forms and answer keys written before schema version 4."""
-    if isinstance(value, dict):
-        return {
-            update_renamed_values(key): update_renamed_values(element)
-            for key, element in value.items()
-        }
-    if isinstance(value, list):
-        return [update_renamed_values(element) for element in value]
-    return _CHOICES.renamed.get(value, value) if isinstance(value, str) else value
+    return convert_nested(value, lambda element: _CHOICES.renamed.get(element, element))
 
 
 def _without_blanks(value: Any) -> Any:
@@ -380,9 +370,7 @@ def form_name(log_name: str) -> str:
 
 def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
     """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
-    template = Template(
-        files("px4fuse.results").joinpath("answer_form.toml").read_text(encoding="utf-8")
-    )
+    template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
         for number, question in enumerate(draw_questions(log_sha256), start=1)
@@ -391,7 +379,7 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
         f"{name:13} {mistake.description}{_format_units(mistake.units)}"
         for name, mistake in MISTAKES.items()
     )
-    return template.substitute(
+    return Template(template).substitute(
         log=log_name,
         form=form_name(log_name),
         sha256=log_sha256,
@@ -416,11 +404,11 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
         value_units = CORRECTIONS.get(mistake.parameter, {})
         value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
-        from_text = "" if mistake.from_s is None else f"from {mistake.from_s:g} s"
-        until_text = "" if mistake.until_s is None else f"until {mistake.until_s:g} s"
+        times = (("from", mistake.from_s), ("until", mistake.until_s))
+        time_texts = [f"{word} {time_s:g} s" for word, time_s in times if time_s is not None]
         details = (
             _format_number_with_unit(mistake.size, mistake.unit, size_units),
-            mistake.when or f"{from_text} {until_text}".strip(),
+            mistake.when or " ".join(time_texts),
             f"shown in {mistake.panel}" if mistake.panel else "",
             f"{mistake.parameter} {value_text}".strip(),
         )

@@ -17,6 +17,7 @@ from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
+from px4fuse.core.text import convert_nested
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
@@ -381,14 +382,6 @@ def round_number(value: float) -> float:
     return round(value, 6) if abs(value) >= 1e4 else float(f"{value:.{SIGNIFICANT_DIGITS}g}")
 
 
-def _round_numbers(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _round_numbers(element) for key, element in value.items()}
-    if isinstance(value, list | tuple):
-        return list(map(_round_numbers, value))
-    return round_number(value) if isinstance(value, float) else value
-
-
 def _to_builtin(value: Any) -> float | dict[str, Any]:
     if isinstance(value, Mapping):
         return dict(value)
@@ -406,7 +399,9 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
         The results contain a number that is not finite.
     """
     plain_results = to_json_dict(results) if isinstance(results, msgspec.Struct) else results
-    rounded_results = _round_numbers(plain_results)
+    rounded_results = convert_nested(
+        plain_results, lambda value: round_number(value) if isinstance(value, float) else value
+    )
     return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

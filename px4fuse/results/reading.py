@@ -8,7 +8,7 @@ import msgspec
 from msgspec.structs import fields
 
 from px4fuse.core.record import decode_record_or_unavailable
-from px4fuse.core.text import clean_text, one_line
+from px4fuse.core.text import clean_text, convert_nested, one_line
 from px4fuse.errors import ResultsError
 from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
@@ -34,7 +34,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if len(data) > MAX_RESULTS_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
     try:
-        decoded = _clean_values(msgspec.json.decode(data))
+        decoded = convert_nested(msgspec.json.decode(data), _clean_value)
         json.loads(data, object_pairs_hook=_require_unique_keys)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
@@ -50,9 +50,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = decoded.get("provenance")
         writer_version = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader_version = (
-            one_line(str(writer_version), 60) if writer_version else "of that schema version"
-        )
+        reader_version = one_line(str(writer_version or "of that schema version"), 60)
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with px4fuse {reader_version}.",
@@ -94,12 +92,10 @@ def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
         raise ValueError("a JSON key is repeated")
 
 
-def _clean_values(value: Any) -> Any:
-    """Clean all texts in decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
+def _clean_value(value: Any) -> Any:
+    """Clean a text of decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
     if isinstance(value, str):
         return clean_text(value)
-    if isinstance(value, dict):
-        return {clean_text(key): _clean_values(child) for key, child in value.items()}
     if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
         raise ValueError("an integer has more than 64 bits")
-    return list(map(_clean_values, value)) if isinstance(value, list) else value
+    return value
