@@ -202,9 +202,9 @@ class HeightFilter:
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
-        start_s = float(segment.time_s[0])
-        self.bias = BiasEstimator(value_m, variance_m2, float(np.median(segment.step_s)))
+        value_m, variance_m2 = np.tile(heights.bias, (configuration_count, 1)).T
+        start_s = segment.time_s[0]
+        self.bias = BiasEstimator(value_m, variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & enabled[heights.reference]
         biased_slots = slice(0, -1) if self.biased[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)

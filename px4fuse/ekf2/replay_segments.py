@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, median_interval
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -439,7 +439,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         clipped_s = imu_s[imu["clipped"].to_numpy() > 0.0]
         begin_rows, end_rows = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
         clipped_moments = clipped_s[
-            end_rows - begin_rows > MAX_CLIPPED_FRACTION / float(np.median(np.diff(imu_s)))
+            end_rows - begin_rows > MAX_CLIPPED_FRACTION / median_interval(imu_s)
         ]
         break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return break_times_s
@@ -554,7 +554,7 @@ def _field_span(fusion_record: FusionRecord) -> Span | None:
     )
     fused_3d_s = is_fused_3d.index.to_numpy()
     is_fused = is_fused_3d.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / np.median(np.diff(fused_3d_s)) < MIN_MAG_LOG_HZ:
+    if not is_fused.any() or 1.0 / median_interval(fused_3d_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
@@ -569,7 +569,7 @@ def _add_field(
     field_gauss = fusion_record.field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    samples_per_row = max(MAG_FUSION_HZ * float(np.median(np.diff(sample_times_s))), 1.0)
+    samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
     field_values = field_gauss.iloc[:, :3].to_numpy()
     field_states = np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]])

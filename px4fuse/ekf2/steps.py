@@ -21,7 +21,14 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import (
+    Ekf2Replay,
+    Spans,
+    component_along,
+    inside_spans,
+    rms_to_truth,
+    rows_inside,
+)
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -55,7 +62,7 @@ STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
-class Step(Record, frozen=True, kw_only=True):
+class Step(Record, kw_only=True):
     """Replacement of one property of KF by that of EKF2, and its effect.
 
     Attributes
@@ -78,7 +85,7 @@ class Step(Record, frozen=True, kw_only=True):
     position_rmse_to_truth_m: NotNegative | None = None
 
 
-class RejectionRun(Record, frozen=True, kw_only=True):
+class RejectionRun(Record, kw_only=True):
     """Longest run of consecutive position samples that EKF2 rejected in flight.
 
     Attributes
@@ -95,14 +102,14 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     distance_m: NotNegative
 
 
-class UnreplayedDifference(Record, frozen=True):
+class UnreplayedDifference(Record):
     """Largest position difference KF - EKF2 at times that the replay does not cover."""
 
     maximum_m: NotNegative
     at_s: float
 
 
-class DifferenceExplanation(Record, frozen=True, kw_only=True):
+class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
     The mean square is the sum of the reductions by all ``steps`` and of the unexplained remainder.
@@ -316,7 +323,7 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 def _longest_rejection(
     baseline_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
-    updates = baseline_replay.updates[inside_spans(baseline_replay.updates.index, spans_s)]
+    updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fused_at_s = updates["fused_at_s"].to_numpy()

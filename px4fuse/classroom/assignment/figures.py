@@ -37,7 +37,7 @@ QUESTIONS = {
 }
 
 
-class FigureFault(Record, frozen=True):
+class FigureFault(Record):
     """Injected fault of a flight in a figure (``figures.toml``), and right answers about it.
 
     ``option`` is the value of ``px4fuse simulate --mistake``, or "" without a fault.
