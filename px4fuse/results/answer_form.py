@@ -420,9 +420,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    for number, letter in enumerate(answers.choices, start=1):
-        if letter:
-            yield f"Answer c{number} about the figures", letter
+    letters = [f"c{number} {letter}" for number, letter in enumerate(answers.choices, 1) if letter]
+    if letters:
+        yield "Answers about the figures", ", ".join(letters)
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
