@@ -248,7 +248,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         return np.stack(arrays, axis=1)[:, configuration_intervals]
 
     event_table = stack_configurations("events")
-    action = np.where(has_gate, event_table["action"], np.where(event_table["usable"], FUSE, IDLE))
+    action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
     is_active = action > IDLE
     event_time_s = segment.time_s[event_steps]
@@ -265,7 +265,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     measured_values, measurement_variance = _measurements_by_event(
         inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
     )
-    is_sequential = inputs.aid == GNSS_POS
     has_velocity = inputs.received.velocity_m_s is not None
     gates = [
         parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
@@ -282,15 +281,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
     heights = vision = None
     has_field = segment.field is not None
-    end_steps_by_intervals = [
-        interval_arrays.events.end_step for interval_arrays in distinct_intervals
-    ]
+    ends = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
     vector_means = []
     for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
         if samples is not None:
-            means = [
-                mean_by_event(segment, samples, end_steps) for end_steps in end_steps_by_intervals
-            ]
+            means = [mean_by_event(segment, samples, end_steps) for end_steps in ends]
             stacked_means = (
                 np.stack(quantities, axis=1)[:, configuration_intervals]
                 for quantities in zip(*means, strict=True)
@@ -303,21 +298,20 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
             mean = mean._replace(sample_count=sample_count)
             vector_means.append((mean, gate, samples.state_rows))
-    has_logged_flag = segment.heights is None or segment.is_acceleration_bad is None
+    follows_log = [
+        segment.heights is None
+        or segment.is_acceleration_bad is None
+        or configuration.keeps_logged_bad_acceleration(inputs)
+        for configuration in configurations
+    ]
     bad_acceleration = BadAcceleration(
-        np.array(
-            [has_logged_flag or c.keeps_logged_bad_acceleration(inputs) for c in configurations]
-        ),
-        inputs.rules.bad_acceleration_s,
-        segment,
+        np.array(follows_log), inputs.rules.bad_acceleration_s, segment
     )
     if segment.heights is not None:
-        barometer_arrays = np.stack(barometer_samples(segment, end_steps_by_intervals), axis=-1)[
-            ..., configuration_intervals
-        ]
+        barometer = np.stack(barometer_samples(segment, ends), axis=-1)
         heights = HeightFilter(
             segment,
-            barometer_arrays,
+            barometer[..., configuration_intervals],
             event_table["time_s"],
             is_active,
             is_enabled_by_aid,
@@ -349,9 +343,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs, segment, parameters, has_biases, has_attitude
     )
     step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))[
-        :, :, None, None
-    ]
+    acceleration_variance = np.tile(
+        parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
+    )
     if (clipped_fraction := segment.clipped_fraction) is not None:
         # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
         clipped_fraction_sums = np.diff(
@@ -469,7 +463,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_rejected[e], is_fused[e], is_reset[e], is_velocity_fused = fusion.decide(
                 e, is_outside_gate, is_velocity_fused
             )
-            if is_sequential:
+            if inputs.aid == GNSS_POS:
                 if not has_field:
                     # without logged magnetometer samples the correction of the tilt is unknown, so
                     # only the tilt variance is set to the logged value

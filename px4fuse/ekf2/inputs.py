@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -360,7 +360,7 @@ def lost_imu_fraction(time_s: Array) -> float:
 
 
 def _explain_missing_imu(time_s: Array) -> Unavailable | None:
-    median_interval_s = float(np.median(np.diff(time_s)))
+    median_interval_s = median_interval(time_s)
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
             ANALYSIS_NAME,
@@ -432,8 +432,7 @@ def read_gnss(
         )
     parameters = fusion_record.parameters
     control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
-    position_samples = track.samples
-    velocity_samples = track.velocity
+    position_samples, velocity_samples = track.samples, track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_log := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
@@ -448,10 +447,11 @@ def read_gnss(
     reported_variance = (
         position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     )
-    velocity = velocity_samples[Columns.VELOCITY].to_numpy()
+    velocity = velocity_variance = None
     fuses_velocity = uses_aid_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
-    velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
-    has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
+    if fuses_velocity and velocity_samples[Columns.VELOCITY].notna().all(axis=None):
+        velocity = velocity_samples[Columns.VELOCITY].to_numpy()
+        velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
@@ -459,8 +459,8 @@ def read_gnss(
         reported_variance.to_numpy(),
         *_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
-        velocity if has_velocity else None,
-        velocity_variance if has_velocity else None,
+        velocity,
+        velocity_variance,
         uses_sender_times=track.assumed_delay_s == 0.0 != logged_delay_s,
     )
 
@@ -646,7 +646,7 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_COPY_INTERVALS_S:
-            median_interval_s = float(np.median(np.diff(track.samples.index)))
+            median_interval_s = median_interval(track.samples.index.to_numpy())
             if (
                 median_interval_s < 0.9 * VISION_COPY_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -40,6 +40,7 @@ from px4fuse.flight.model import (
 from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
+T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
@@ -227,7 +228,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     """Compare a replay (with logged parameters) with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
+    if rows_inside(ekf2.state, replay.evaluated_s).empty:
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
@@ -311,24 +312,25 @@ def _compare_innovations(
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest horizontal position difference (m) with flow only; None without it."""
-    flow_only_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, replay.flow_only_spans_s)
-    ].to_numpy()
-    if not len(flow_only_s):
+    logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
+    if logged_state.empty:
         return None
-    north, east = (
-        component_along(replay.published, Columns.POSITION, direction, flow_only_s)
-        - component_along(ekf2.state, Columns.POSITION, direction, flow_only_s)
-        for direction in np.eye(3)[:2]
+    north_m, east_m = (
+        _replayed_minus_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
     )
-    return float(np.hypot(north, east).max())
+    return float(np.hypot(north_m, east_m).max())
+
+
+def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
+    """Return the difference of a column of the published state at the times of the log."""
+    replayed = np.interp(logged_state.index, replay.published.index, replay.published[name])
+    return np.asarray(replayed - logged_state[name])
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged_state = ekf2.record.delayed
-    logged_state = logged_state[inside_spans(logged_state.index, replay.evaluated_s)]
+    logged_state = rows_inside(ekf2.record.delayed, replay.evaluated_s)
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
@@ -404,6 +406,11 @@ def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
     return is_inside
 
 
+def rows_inside(table: T, spans_s: Spans) -> T:
+    """Return the rows of a table, indexed by time (s), inside one of the spans."""
+    return table[inside_spans(table.index, spans_s)]
+
+
 def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
@@ -428,23 +435,15 @@ def _axis_agreement(
     ekf2: Ekf2,
     ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log = (
-        innovations[f"innovation_{axis}_m"].to_numpy()
-        for innovations in (replayed_innovations, logged_innovations)
-    )
-    S, S_log = (
-        innovations[f"innovation_variance_{axis}_m2"].to_numpy()
+    nu, nu_log, S, S_log = (
+        innovations[name].to_numpy()
+        for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
         for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
-    evaluated_state_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, ekf2_replay.evaluated_s)
-    ].to_numpy()
-    direction = np.eye(3)[AXIS_NAMES.index(axis)]
+    logged_state = rows_inside(ekf2.state, ekf2_replay.evaluated_s)
     position_m, velocity_m_s = (
-        component_along(ekf2_replay.published, columns, direction, evaluated_state_s)
-        - component_along(ekf2.state, columns, direction, evaluated_state_s)
-        for columns in (Columns.POSITION, Columns.VELOCITY)
+        _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),

@@ -21,7 +21,14 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import (
+    Ekf2Replay,
+    Spans,
+    component_along,
+    inside_spans,
+    rms_to_truth,
+    rows_inside,
+)
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -316,7 +323,7 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 def _longest_rejection(
     baseline_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
-    updates = baseline_replay.updates[inside_spans(baseline_replay.updates.index, spans_s)]
+    updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fused_at_s = updates["fused_at_s"].to_numpy()

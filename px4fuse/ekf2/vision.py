@@ -130,11 +130,10 @@ class VisionFilter:
         self.noise_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
         )
-        start_s = float(segment.time_s[0])
         bias = np.zeros((configuration_count, 2))
-        self.bias = BiasEstimator(bias, bias + np.inf, float(np.median(segment.step_s)))
+        self.bias = BiasEstimator(bias, bias + np.inf, segment.step_s)
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
-        self.fused_s = np.full(configuration_count, start_s)
+        self.fused_s = np.full(configuration_count, segment.time_s[0])
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
+from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
@@ -27,6 +28,7 @@ from px4fuse.ekf2.replay import (
     logged_aid_innovations,
     logged_innovations,
     rms_to_truth,
+    rows_inside,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -292,8 +294,8 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
     >>> sweep_values("EKF2_EV_DELAY", 0, 200, 3)
     [0.0, 100.0, 200.0]
     """
-    check_parameters({name: low})
-    check_parameters({name: high})
+    for limit in (low, high):
+        check_parameters({name: limit})
     if not low < high:
         raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller parameter value first.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
@@ -356,7 +358,7 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
-    evaluated_updates = updates[inside_spans(updates.index, evaluated_s)]
+    evaluated_updates = rows_inside(updates, evaluated_s)
     fused_at_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
@@ -372,9 +374,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         )
         variance_after = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
-    fused_s = evaluated_updates["fused_at_s"][
-        (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
-    ]
+    fused_s = evaluated_updates["fused_at_s"][evaluated_updates[["fused", "reset"]].any(axis=1)]
     reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
         reset_count += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
@@ -388,7 +388,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused_s.to_numpy(), evaluated_s),
+        longest_without_fusion_s=_longest_between_fusions(fused_s, evaluated_s),
         resets=int(reset_count),
         late=replay.late,
         lost=replay.lost,
@@ -398,19 +398,18 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
 def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged_updates = logged_innovations(ekf2)
-    evaluated_updates = logged_updates[inside_spans(logged_updates.index, evaluated_s)]
+    evaluated_updates = rows_inside(logged_innovations(ekf2), evaluated_s)
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     reset_times_s = horizontal_resets_s(ekf2) - horizon_s
     reset_times_s = reset_times_s[inside_spans(reset_times_s, evaluated_s)]
-    replayed_count = int(inside_spans(replay.updates.index, evaluated_s).sum())
+    replayed_count = len(rows_inside(replay.updates, evaluated_s))
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed_count} innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed_count:
-        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
+        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
         longest_gap_s = _longest_between_fusions(
             np.concatenate([fused_s, reset_times_s]), evaluated_s
         )
@@ -455,7 +454,7 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged_variance = ekf2.variance
-    evaluated_state_s = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
+    evaluated_state_s = rows_inside(ekf2.state, evaluated_s).index.to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position_m = component_along(
@@ -469,9 +468,7 @@ def _make_summary(
         if isinstance(logged_variance, Unavailable):
             sigma = logged_variance
         else:
-            variance_s = logged_variance.index[
-                inside_spans(logged_variance.index, evaluated_s)
-            ].to_numpy()
+            variance_s = rows_inside(logged_variance, evaluated_s).index
             axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
             sigma = float(
                 np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
@@ -482,7 +479,7 @@ def _make_summary(
     aids = {
         name: _summarise_aid(evaluated, evaluated_s)
         for name, updates in other_aid_updates.items()
-        if len(evaluated := updates[inside_spans(updates.index, evaluated_s)])
+        if len(evaluated := rows_inside(updates, evaluated_s))
     }
     if velocity := aids.pop(GNSS_VEL.name, None):
         more["velocity_rejected_fraction"] = velocity.rejected_fraction
@@ -508,15 +505,13 @@ def _innovation_statistics(
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
-    rejected_flags = evaluated_updates["rejected"].to_numpy()
-    fused_s = evaluated_updates.index.to_numpy()[rejected_flags == 0.0]
+    fused = evaluated_updates[evaluated_updates["rejected"] == 0.0]
     longest_s = max(
-        _longest_between_fusions(fused_s[inside_spans(fused_s, (span,))], (span,))
-        for span in evaluated_s
+        _longest_between_fusions(rows_inside(fused, (span,)).index, (span,)) for span in evaluated_s
     )
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
-        float(rejected_flags.mean()),
+        float(evaluated_updates["rejected"].mean()),
         longest_s,
     )
 
@@ -530,7 +525,7 @@ def _heading_error(
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    heading = heading[inside_spans(heading.index, evaluated_s)]
+    heading = rows_inside(heading, evaluated_s)
     true_heading = np.interp(
         heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
@@ -538,21 +533,19 @@ def _heading_error(
     return float(np.degrees(np.nanmean(error_rad)))
 
 
-def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
+def _longest_between_fusions(fused_s: ArrayLike, evaluated_s: Spans) -> float:
     fusion_times_s = [evaluated_s[0][0], evaluated_s[-1][1]]
-    return float(np.max(np.diff(np.sort(np.concatenate([fused_s, fusion_times_s])))))
+    return float(np.diff(np.sort(np.append(fusion_times_s, fused_s))).max())
 
 
 def _deviation_note(
     model: Model, replay: Ekf2Replay, replays_without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
-    position_difference_m = (
-        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION]
+    position_difference_m = rows_inside(
+        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION],
+        evaluated_s,
     )
-    position_difference_m = position_difference_m[
-        inside_spans(position_difference_m.index, evaluated_s)
-    ]
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())

@@ -51,7 +51,7 @@ class FigureFault(Record):
     option: str = ""
 
 
-FAULTS = read_toml(__file__, dict[str, FigureFault], "figures.toml")
+FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
 def _shuffle(names: Iterable[str], label: str, draw_number: Callable[[str], float]) -> list[str]:
