@@ -119,8 +119,7 @@ def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     )  # fmt: skip
     marked = [replace(each, interval=(each.ratio, 2.0 * each.ratio)) for each in ratios]
     (block,) = page_of(replace(SMALL_SIGMA_A, verdicts=tuple(marked))).blocks
-    assert [row["beyond"] for row in block["rows"]] == [-1, 0, 0, 1]
-    assert block["rows"][0]["interval"] is None
+    assert [row["mark"] for row in block["rows"]] == ["below", "truth", "source", "above"]
     assert block["rows"][2]["interval"] == [1.0, 1.0]
 
 

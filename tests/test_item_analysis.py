@@ -72,7 +72,7 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     assert "Your flight also has this fault" in questions[2][0]
     assert "your answer is: yaw" in questions[3][0]
     assert "Right: delay" in questions[3][1]
-    assert "overconfident (σ is wrong by a factor of 2)" in questions[4][1]
+    assert len(questions) == 4
 
 
 def test_oral_exam_page_lists_n_questions_per_student() -> None:

@@ -94,9 +94,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{filter_name.upper()} {MARKS[reference_name]}",
-                    "ratio",
-                    visible_from="tablet",
+                    f"{filter_name.upper()} {MARKS[reference_name]}", "ratio", visible_from="tablet"
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),

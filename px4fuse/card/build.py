@@ -145,7 +145,7 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
+    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
     """Build the diagnosis card of a flight without a position source, on EKF2's aiding sources."""
     root_findings = [group[0] for group in group_by_root(analysis.findings)]

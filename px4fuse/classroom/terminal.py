@@ -28,7 +28,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
     texts = {
         "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
         "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-        "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
+        "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
         f"{EASIEST_DIFFICULTY:g} to {UNDETECTABLE_DIFFICULTY:g}. The difficulty is the smallest "
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "

@@ -35,8 +35,7 @@ FAIL_LEVELS = ("failed", *SEVERITIES)
 )
 @options.settings_options
 @options.fail_option(
-    FAIL_LEVELS,
-    "Exit with code 1 if a log failed or has a finding of at least this severity.",
+    FAIL_LEVELS, "Exit with code 1 if a log failed or has a finding of at least this severity."
 )
 @options.open_option
 def batch(
@@ -61,13 +60,7 @@ def batch(
     gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:
         with outputs.progress() as show_progress:
-            fleet = run(
-                logs,
-                output,
-                scheduler=scheduler,
-                progress=show_progress,
-                **option_values,
-            )
+            fleet = run(logs, output, scheduler=scheduler, progress=show_progress, **option_values)
     except KeyboardInterrupt as interrupt:
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():

@@ -26,11 +26,7 @@ from px4fuse.request import settings_name
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
     "long time.",
 )
-@options.flag(
-    "-v",
-    "--verbose",
-    help="Print all findings, axes and KF settings on the terminal.",
-)
+@options.flag("-v", "--verbose", help="Print all findings, axes and KF settings on the terminal.")
 @options.flag("-q", "--quiet", help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(

@@ -39,16 +39,12 @@ from px4fuse.errors import OutputError, SettingsError
 )
 @max_size_option
 @input_option(
-    "--key",
-    "FILE.json",
-    "Answer key of the class, written by px4fuse simulate --assignment.",
+    "--key", "FILE.json", "Answer key of the class, written by px4fuse simulate --assignment."
 )
 @output_option("DIR", "Output folder for the class table and the feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
 @input_option(
-    "--roster",
-    "FILE.csv",
-    "Class list with all students.  [default: the students in --key]",
+    "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
 )
 @click.option(
     "--attempt",
@@ -89,10 +85,7 @@ from px4fuse.errors import OutputError, SettingsError
     help="Write questions.txt: N questions to each student for an oral check, from the student's "
     "own form and flight, with the expected answers. Requires --key.",
 )
-@flag(
-    "--include-pending",
-    help="Count points that the instructor has not confirmed yet.",
-)
+@flag("--include-pending", help="Count points that the instructor has not confirmed yet.")
 @input_option(
     "--worksheet",
     "FILE.csv",

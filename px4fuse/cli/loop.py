@@ -13,13 +13,7 @@ from px4fuse.cli import options, outputs
 from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.request import (
-    GivenClosure,
-    Landing,
-    LoopRequest,
-    command_line,
-    settings_name,
-)
+from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, settings_name
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
@@ -122,10 +116,7 @@ _loop_option = partial(options.request_option, LoopRequest)
     "the path, 0.02 to 0.5 m]",
     0.2,
 )
-@_loop_option(
-    "frame",
-    "Coordinate frame of a trajectory file.  [default: detected]",
-)
+@_loop_option("frame", "Coordinate frame of a trajectory file.  [default: detected]")
 @options.system_option
 @options.max_size_option
 @options.student_options

@@ -25,13 +25,7 @@ from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.request import (
-    AUTO,
-    OPTION_NAMES,
-    SUFFIX_UNITS,
-    ComparisonRequest,
-    PositionFile,
-)
+from px4fuse.request import AUTO, OPTION_NAMES, SUFFIX_UNITS, ComparisonRequest, PositionFile
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -218,11 +212,7 @@ student_options = _combine_options(
     click.option(
         "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
     ),
-    input_option(
-        "--notes",
-        "FILE.md",
-        "Text of the student (Markdown), printed in the report.",
-    ),
+    input_option("--notes", "FILE.md", "Text of the student (Markdown), printed in the report."),
     input_option(
         "--answers",
         "FILE.toml",
@@ -335,9 +325,7 @@ filter_options = _combine_options(
         20.0,
     ),
     _comparison_option(
-        "end_s",
-        "End of the analysed time span (s after the first data).  [default: landing]",
-        60.0,
+        "end_s", "End of the analysed time span (s after the first data).  [default: landing]", 60.0
     ),
     _comparison_option(
         "position_source",

@@ -31,13 +31,7 @@ from px4fuse.cli.outputs import (
     help="Difficulty of the flights. 1: one large fault; 2: one smaller fault; 3: one or two "
     "small faults.",
 )
-@count_option(
-    "--flights",
-    1,
-    20,
-    default=10,
-    help="Number of simulated flights on the page.",
-)
+@count_option("--flights", 1, 20, default=10, help="Number of simulated flights on the page.")
 @output_option("FILE.html", "Web page to write.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open",

@@ -117,5 +117,5 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
         expected_text = ""
         unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
         if unit and (number := convert_to_unit(value, unit)) is not None:
-            expected_text = f" in {UNIT_NAMES[unit]}. Give {number:g}"
+            expected_text = f" in {UNIT_NAMES.get(unit, unit)}. Give {number:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{expected_text}.") from error

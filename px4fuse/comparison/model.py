@@ -34,7 +34,7 @@ Track: TypeAlias = pd.DataFrame | Unavailable
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
-class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
+class ErrorsAgainstTruth(Record, kw_only=True):
     """Errors of one filter against ground truth, at the times of EKF2's published state.
 
     The mean NEES (expected 1) is None without a reported variance. It has no chi-square band,
@@ -55,7 +55,7 @@ class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
         return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"
 
 
-class FilterSummary(Consistency, frozen=True, kw_only=True):
+class FilterSummary(Consistency, kw_only=True):
     """Consistency of one filter along one axis, its reported σ and its errors.
 
     Attributes
@@ -74,7 +74,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class UntestedFilter(Unavailable, frozen=True, kw_only=True):
+class UntestedFilter(Unavailable, kw_only=True):
     """Reason why a filter was not tested for consistency, with its reported σ and errors."""
 
     sigma_p_median_m: Positive | None = None
@@ -84,7 +84,7 @@ class UntestedFilter(Unavailable, frozen=True, kw_only=True):
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class Difference(Record, frozen=True, kw_only=True):
+class Difference(Record, kw_only=True):
     """Difference KF - EKF2 along one axis, at EKF2's sample times."""
 
     count: Count
@@ -96,7 +96,7 @@ class Difference(Record, frozen=True, kw_only=True):
     velocity_maximum_m_s: NotNegative
 
 
-class Updates(Record, frozen=True, kw_only=True):
+class Updates(Record, kw_only=True):
     """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
 
     count: Count
@@ -106,7 +106,7 @@ class Updates(Record, frozen=True, kw_only=True):
     input_gap_s: NotNegative
 
 
-class AxisComparison(Record, frozen=True, kw_only=True):
+class AxisComparison(Record, kw_only=True):
     """Result of the comparison along one axis, with the KF run and the tracks.
 
     Attributes

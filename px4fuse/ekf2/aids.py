@@ -55,7 +55,7 @@ MIN_HEIGHT_M = 2.0
 HEIGHT_MEDIAN_SAMPLES = 11
 
 
-class AidAxis(Record, frozen=True, kw_only=True):
+class AidAxis(Record, kw_only=True):
     """Innovation statistics of one aiding source along one axis, in the unit of its measurements.
 
     Attributes
@@ -88,7 +88,7 @@ class AidAxis(Record, frozen=True, kw_only=True):
         return self.innovation_mean / self.s_sqrt_median
 
 
-class AidResult(Record, frozen=True, kw_only=True):
+class AidResult(Record, kw_only=True):
     """Fusion and consistency of one aiding source of EKF2 in flight.
 
     Attributes

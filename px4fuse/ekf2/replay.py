@@ -76,7 +76,7 @@ MAX_NIS_DIFFERENCE = 0.25
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
-class AxisAgreement(Record, frozen=True, kw_only=True):
+class AxisAgreement(Record, kw_only=True):
     """Agreement of the EKF2 replay (with logged parameters) with the log, along one axis.
 
     Attributes
@@ -102,7 +102,7 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
     velocity_rms_difference_m_s: NotNegative
 
 
-class Agreement(Record, frozen=True, kw_only=True):
+class Agreement(Record, kw_only=True):
     """Agreement of the EKF2 replay (with logged parameters) with the log.
 
     Attributes
@@ -160,7 +160,7 @@ class Agreement(Record, frozen=True, kw_only=True):
         )
 
 
-class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
+class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     """Replay of EKF2 with one set of parameters.
 
     Attributes

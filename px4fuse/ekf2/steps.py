@@ -63,7 +63,7 @@ STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
-class Step(Record, frozen=True, kw_only=True):
+class Step(Record, kw_only=True):
     """Replacement of one property of KF by that of EKF2, and its effect.
 
     Attributes
@@ -86,7 +86,7 @@ class Step(Record, frozen=True, kw_only=True):
     position_rmse_to_truth_m: NotNegative | None = None
 
 
-class RejectionRun(Record, frozen=True, kw_only=True):
+class RejectionRun(Record, kw_only=True):
     """Longest run of consecutive position samples that EKF2 rejected in flight.
 
     Attributes
@@ -103,14 +103,14 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     distance_m: NotNegative
 
 
-class UnreplayedDifference(Record, frozen=True):
+class UnreplayedDifference(Record):
     """Largest position difference KF - EKF2 at times that the replay does not cover."""
 
     maximum_m: NotNegative
     at_s: float
 
 
-class DifferenceExplanation(Record, frozen=True, kw_only=True):
+class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
     The mean square is the sum of the reductions by all ``steps`` and of the unexplained remainder.

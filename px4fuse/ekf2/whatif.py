@@ -89,7 +89,7 @@ MAX_REJECTED_SPREAD = 0.03
 MAX_RMSE_RATIO = 1.15
 
 
-class AxisSummary(Record, frozen=True):
+class AxisSummary(Record):
     """EKF2 statistics along one axis in one column of the parameter table.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
@@ -102,7 +102,7 @@ class AxisSummary(Record, frozen=True):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-class HeightSummary(Record, frozen=True):
+class HeightSummary(Record):
     """Statistics of one height sensor, or of vision that EKF2 fuses in addition to GNSS."""
 
     nis_mean: NotNegative
@@ -118,7 +118,7 @@ class HeightSummary(Record, frozen=True):
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
 
-class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
+class Summary(Record, kw_only=True, omit_defaults=False):
     """EKF2 statistics in one column of the parameter table: logged, replayed, or changed.
 
     Attributes

@@ -16,25 +16,7 @@ BokehStyle = dict[str, Any]
 # Columns of the Bokeh data sources, filled by JavaScript: time, position, velocity and σ of both;
 # KF gains; position error and its ±2σ limits; plotted values x, y, z; arrow angle; event row, start
 # and end
-SOURCE_COLUMNS = (
-    "t",
-    "p",
-    "v",
-    "sp",
-    "sv",
-    "k0",
-    "k1",
-    "e",
-    "minus",
-    "plus",
-    "x",
-    "y",
-    "z",
-    "turn",
-    "row",
-    "left",
-    "right",
-)
+SOURCE_COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
 # JavaScript sets the colours by `name`. KF is solid and round, EKF2 dashed and square
 KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
@@ -68,7 +50,7 @@ LINE_STYLES = {
 }
 
 
-class Plot(Record, frozen=True):
+class Plot(Record):
     """Plot over time.
 
     Attributes
@@ -82,14 +64,14 @@ class Plot(Record, frozen=True):
     unit: str = ""
 
 
-class View(Record, frozen=True):
+class View(Record):
     """Tab of the page; ``plots`` are the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
 
 
-class Figures(Record, frozen=True):
+class Figures(Record):
     """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]
@@ -223,7 +205,9 @@ def _axis_range(name: str | None = None) -> Range1d:
 
 
 def _empty_source(name: str) -> ColumnDataSource:
-    return ColumnDataSource({column: [] for column in SOURCE_COLUMNS}, name=f"{name}-source")
+    return ColumnDataSource(
+        {column: [] for column in SOURCE_COLUMNS.split()}, name=f"{name}-source"
+    )
 
 
 def _event_plot(data: PageData, time_range: Range1d) -> Any:
@@ -273,7 +257,6 @@ def _phase_plot() -> Any:
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
     _add_cursor(plot_figure, name="measurement", line_dash=[2, 2])
-    plot_figure.line("p", "v", source=_empty_source("trail-means"), name="measured")
     plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
     plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
     _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")

@@ -47,6 +47,9 @@ const Explore = (async () => {
     setting.number = make("input", "", { type: "number", id: `${setting.id}-value`, step: "any" });
     setting.slider = make("input", "", {
       type: "range", id: setting.id, min: 0, max: TICKS, step: 1, ariaLabel: setting.title });
+    const id = `${setting.id}-likely`, ticks = make("datalist", "", { id });
+    ticks.append(setting.tick = make("option"));
+    setting.slider.setAttribute("list", id);
     setting.slider.addEventListener("input", () => {
       set({ [setting.key]: fromSlider(setting, Number(setting.slider.value)) }, true);
     });
@@ -57,7 +60,7 @@ const Explore = (async () => {
       showMessage(`${setting.title} must be between ${low} and ${high} ${setting.unit}.`);
       show();
     });
-    box.append(label, setting.number, setting.slider);
+    box.append(label, setting.number, setting.slider, ticks);
     if (setting.key === "clock_offset_s" && fixedReason) box.append(make("p", fixedReason, "note"));
     $("sliders").append(box);
   }
@@ -76,9 +79,11 @@ const Explore = (async () => {
       $("input-note").textContent = imu;
     }
   }
-  function showLikely({ likely, estimate }) {
-    const value = likely?.() ?? null;
-    estimate.textContent = value === null ? "" : `(maximum likelihood ${round(value, 3)})`;
+  /* Show the maximum-likelihood estimate in the label and on the track of a slider */
+  function showLikely(setting) {
+    const value = setting.likely?.() ?? null;
+    setting.tick.value = value === null ? "" : toSlider(setting, value);
+    setting.estimate.textContent = value === null ? "" : `(maximum likelihood ${round(value, 3)})`;
   }
   const axisNow = () => axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
@@ -90,8 +95,8 @@ const Explore = (async () => {
     showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
-    const [sigmaA, sigmaZ] = likelyNow();
-    set({ sigma_a_m_s2: round(sigmaA, 3), sigma_z_m: round(sigmaZ, 3), dt_s: flight.settings.dt_s });
+    const [sigmaA, sigmaZ] = likelyNow().map((value) => round(value, 3));
+    set({ sigma_a_m_s2: sigmaA, sigma_z_m: sigmaZ, dt_s: flight.settings.dt_s });
     showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
   onClick("ekf2-r", () => {

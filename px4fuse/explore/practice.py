@@ -62,7 +62,7 @@ FINDING_WITH_TIME_BY_MISTAKE = {
 NOISY_UWB = "noisy-uwb"
 
 
-class HiddenMistake(Record, frozen=True):
+class HiddenMistake(Record):
     """Injected fault in a practice flight.
 
     Attributes
@@ -87,7 +87,7 @@ class HiddenMistake(Record, frozen=True):
     has_either_sign: bool = False
 
 
-class MistakeTable(Record, frozen=True):
+class MistakeTable(Record):
     """Answers of the quiz with their texts, and the injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
@@ -111,7 +111,7 @@ class PracticeFlight:
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
-def draw_flights(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
+def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...]:
     """Draw random practice flights, in which all faults are equally frequent.
 
     Parameters
@@ -156,8 +156,8 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
 
 def practice_text(
     seed: int,
-    level: int = 1,
-    count: int = 10,
+    level: int,
+    count: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
     """Simulate the flights of :func:`draw_flights`, and return the practice page (HTML).

@@ -2,8 +2,6 @@
 // the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers.
 const Step = (() => {
   const CORNERS = 120;
-  // number of previous KF steps whose positions and velocities are drawn
-  const TRAIL = 60;
   // duration of a prediction or update in the animation
   const STEP_TIME_MS = 400;
 
@@ -157,8 +155,6 @@ const Step = (() => {
       setSource("now", ellipse(now));
       setSource("before", ellipse(previous));
       setSource("mean", { p: [now[0]], v: [now[1]] });
-      const from = Math.max(current.i - TRAIL, 0);
-      setSource("trail-means", { p: run.steps.p.subarray(from, current.i), v: run.steps.v.subarray(from, current.i) });
       const isMeasured = current.u >= 0, z = run.updates.z[current.u];
       const [band, line] = ["band", "measurement"].map((name) => plot.center.find((item) => item.name === name));
       band.visible = line.visible = isMeasured;

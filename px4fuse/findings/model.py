@@ -16,7 +16,7 @@ from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.model import PositionKind, PositionTrack
 
 
-class CatalogueEntry(Record, frozen=True):
+class CatalogueEntry(Record):
     """Texts of a finding, and its place among other findings.
 
     Attributes
@@ -53,7 +53,7 @@ GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging"
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
 
 
-class Example(Record, frozen=True):
+class Example(Record):
     """Example of a finding, with its false alarms and detection rates (tests/studies/rates.csv).
 
     Attributes
@@ -79,7 +79,7 @@ def load_examples() -> Mapping[str, Example]:
     )
 
 
-class SourceWords(Record, frozen=True):
+class SourceWords(Record):
     """Causes and actions of findings about the position source, for one kind of source."""
 
     smoothing_action: str

@@ -102,7 +102,8 @@ NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, DISTURBANCES = (
     {
         name: msgspec.convert(
-            {"name": name, **row} | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
+            {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
@@ -113,9 +114,15 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     AIDS.__getitem__,
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
-PARAMETERS = msgspec.convert(PARAMETER_TABLES["parameters"], dict[str, Parameter])
+PARAMETERS, _LOGGED_PARAMETERS = (
+    msgspec.convert(
+        {name: row for names, row in PARAMETER_TABLES[table].items() for name in names.split()},
+        dict[str, Parameter],
+    )
+    for table in ("parameters", "logged")
+)
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
-PARAMETER_RANGES = PARAMETERS | msgspec.convert(PARAMETER_TABLES["logged"], dict[str, Parameter])
+PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
 FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5

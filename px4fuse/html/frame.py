@@ -107,7 +107,7 @@ def boxes_section(
     title: str,
     person_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
-    other_rows: Sequence[tuple[str, float | None, str]] = (),
+    other_rows: Sequence[tuple[str, float | None, str]],
 ) -> Section:
     """Return a section with input boxes for points and comments, exported as CSV.
 

@@ -23,7 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
+# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.solver.SOLUTIONS
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",

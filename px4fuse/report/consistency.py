@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary, UntestedFilter
+from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
@@ -25,7 +25,7 @@ from px4fuse.report.phrases import (
     filters_by_name,
     format_noise_estimate,
     format_settings,
-    verdict_rows,
+    verdict_cells,
 )
 from px4fuse.report.style import (
     INNOVATION_DOTS,
@@ -94,11 +94,12 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes")
     head = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
-    page.table(
-        head,
-        verdict_rows(analysis.axes.values(), _statistic_cells),
-        right_aligned_columns=(2, 5, 6, 7, 8),
-    )
+    rows = [
+        [*verdict_cells(axis_result, name), *_statistic_cells(consistency)]
+        for axis_result in analysis.axes.values()
+        for name, consistency in filters_by_name(axis_result).items()
+    ]
+    page.table(head, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()
@@ -171,7 +172,7 @@ def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
         highest_nis = max(highest_nis, 1.4 * settled_nis.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest_nis, highest_nis))
-    set_plain_ticks(axes.yaxis)
+    set_plain_ticks(axes)
 
 
 def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
@@ -232,9 +233,7 @@ def _whiteness_sentence(result: AxisComparison, series: InnovationSeries) -> str
     return "\n".join(sentences)
 
 
-def _statistic_cells(
-    _: AxisComparison, __: str, consistency: FilterSummary | UntestedFilter
-) -> list[str]:
+def _statistic_cells(consistency: Consistency | Unavailable) -> list[str]:
     if isinstance(consistency, Unavailable):
         return [""] * 5
     return [

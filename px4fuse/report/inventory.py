@@ -32,7 +32,7 @@ def summary(inventory: Inventory, request: ComparisonRequest) -> Page:
         for option in inventory.abilities
     ]
     page.table(("possible", "analysis", ""), rows)
-    if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
+    if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     lists = {

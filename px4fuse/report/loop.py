@@ -12,7 +12,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import SINGLE_LOOP_REASON
-from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, Loop
+from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
@@ -159,10 +159,18 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         write_finding(page, group)
     names = [reference.name for reference in loop.references]
     head = ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)]
-    rows = [
-        [path.name, format_correction(path), *(_format_ate(path.scores[name]) for name in names)]
-        for path in loop.reported_paths
-    ]
+    rows = []
+    for path in loop.reported_paths:
+        correction_text = "–"
+        if path.correction_max_m:
+            correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
+        ate_texts = [
+            _format_error(score.ate.translation_m, score.ate.interval_m)
+            if isinstance(score := path.scores[name], Evaluation)
+            else "–"
+            for name in names
+        ]
+        rows.append([path.name, correction_text, *ate_texts])
     page.table(head, rows)
     page.write_small(
         "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
@@ -278,12 +286,6 @@ def missing_corrections(loop: Loop) -> list[str]:
     return list(reasons)
 
 
-def _format_ate(score: Evaluation | Unavailable) -> str:
-    if isinstance(score, Unavailable):
-        return "–"
-    return _format_error(score.ate.translation_m, score.ate.interval_m)
-
-
 def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
     interval_text = format_interval(interval)
     return _format_rmse(translation) + (f" ({interval_text})" if interval_text else "")
@@ -291,12 +293,6 @@ def _format_error(translation: Statistics | Unavailable, interval: Interval | Un
 
 def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
-
-
-def format_correction(correction: CorrectedPath) -> str:
-    if not correction.correction_max_m:
-        return "–"
-    return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
 def graph_summary(solved_graph: Graph) -> Page:

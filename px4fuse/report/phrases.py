@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,36 +81,17 @@ def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unteste
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
-def verdict_rows(
-    axes: Iterable[AxisComparison],
-    extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
-) -> list[list[Cell]]:
-    """Return a table row for each axis and filter, ending with the extra cells."""
-    rows: list[list[Cell]] = []
-    for result in axes:
-        for name, consistency in filters_by_name(result).items():
-            label = result.axis.label.removeprefix("the ") if name == "KF" else ""
-            nis_cells, colour = ("", ""), MUTED_COLOUR
-            if isinstance(consistency, Consistency):
-                nis_cells = (
-                    format_number(consistency.nis_mean),
-                    "{:.2f} – {:.2f}".format(*consistency.nis_band),
-                )
-                colour = (
-                    GOOD_COLOUR
-                    if consistency.verdict == "consistent"
-                    else SEVERITY_COLOURS["warning"]
-                )
-            rows.append(
-                [
-                    label,
-                    name,
-                    *nis_cells,
-                    (format_verdict(consistency), colour),
-                    *extra_cells(result, name, consistency),
-                ]
-            )
-    return rows
+def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
+    """Return the first cells of the table row of an axis and a filter ("KF" or "EKF2")."""
+    consistency = filters_by_name(result)[name]
+    label = result.axis.label.removeprefix("the ") if name == "KF" else ""
+    if isinstance(consistency, Unavailable):
+        return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
+    is_consistent = consistency.verdict == "consistent"
+    colour = GOOD_COLOUR if is_consistent else SEVERITY_COLOURS["warning"]
+    band_text = "{:.2f} – {:.2f}".format(*consistency.nis_band)
+    verdict = format_verdict(consistency), colour
+    return [label, name, format_number(consistency.nis_mean), band_text, verdict]
 
 
 def write_errors(page: Page, analysis: Analysis) -> None:
@@ -119,16 +100,16 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
-    def rms_cells(
-        result: AxisComparison, name: str, consistency: FilterSummary | UntestedFilter
-    ) -> list[str]:
-        difference = result.difference if name == "KF" else None
-        cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
-        return cells + [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
-
+    rows = []
+    for result in axes:
+        for name, consistency in filters_by_name(result).items():
+            difference = result.difference if name == "KF" else None
+            cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+            cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
+            rows.append([*verdict_cells(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, verdict_rows(axes, rms_cells), right_aligned_columns=(2, 3, 5, 6, 7, 8))
+    page.table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.report import clock, fonts
+from px4fuse.report import clock
 from px4fuse.report.cover import ALL_FINDINGS, FlightResults
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
@@ -99,18 +99,13 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
-    student, versions = results.student, results.provenance
+    versions = results.provenance
     facts = {
         "command": versions.command,
         "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
         "libraries": ", ".join(f"{name} {version}" for name, version in versions.libraries.items()),
         "results": "attached to this PDF as results.json",
     }
-    if fonts.missing_characters(student.name + student.id + student.notes):
-        facts["fonts"] = (
-            f"{fonts.NO_GLYPH} replaces characters for which no font is installed on this "
-            "computer; results.json contains the original text"
-        )
     _write_section(page, "Made with", facts.items())
 
 

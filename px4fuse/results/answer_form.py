@@ -29,7 +29,7 @@ NO_MISTAKE_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
-class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
+class MistakeKind(Record, rename={"size_quantity": "in"}):
     """Injected fault that a student can name, with the quantity of its size.
 
     ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
@@ -45,7 +45,7 @@ class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
         return _UNITS[self.size_quantity]
 
 
-class FormChoices(Record, frozen=True):
+class FormChoices(Record):
     """Allowed answers of the answer form (``form.toml``), and new names of old answers."""
 
     behaviours: tuple[str, ...]
@@ -94,7 +94,7 @@ CHOICES_HEAD = """
 """
 
 
-class Choice(Record, frozen=True):
+class Choice(Record):
     """Question about a figure, with five answers: the student chooses one."""
 
     question: str
@@ -110,7 +110,7 @@ class Choice(Record, frozen=True):
         return "\n#     ".join([self.question, *options])
 
 
-class StudentMistake(Record, frozen=True):
+class StudentMistake(Record):
     """Injected fault of a flight that a student names in the answer form.
 
     ``from_s`` and ``until_s`` are times since the first data. ``parameter`` is a correction with a
@@ -145,7 +145,7 @@ class StudentMistake(Record, frozen=True):
         return self.value * units.get(self.value_unit, 1.0)
 
 
-class Answers(Record, frozen=True, kw_only=True):
+class Answers(Record, kw_only=True):
     """Student's answers about one flight; answers left blank are absent.
 
     Attributes
@@ -181,7 +181,7 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 )
 
 
-class FormQuestion(Record, frozen=True):
+class FormQuestion(Record):
     """Question about KF along the main axis, which the student answers with an own filter.
 
     Attributes
@@ -261,11 +261,9 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     """Describe the invalid answer and the accepted values, or the line that is not TOML."""
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
-        content = one_line(text.splitlines()[int(line_match[1]) - 1], 60)
-        return (
-            f"line {line_match[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in "
-            "quotes"
-        )
+        line = line_match[1]
+        content = one_line(text.splitlines()[int(line) - 1], 60)
+        return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
     path_names = re.findall(r"\w+", path)
     if not path_names:
@@ -286,9 +284,11 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     filled_form = _without_blanks(update_renamed_values(form))
     mistakes = filled_form.pop("mistake", ())
-    quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
-    quantity_names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
-    choices = msgspec.convert(filled_form.pop("choices", {}), dict[str, Any])
+    quantities, choices = (
+        msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
+        for name in ("quantities", "choices")
+    )
+    quantity_names = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
     choice_names = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     if unknown_fields := sorted(
         {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_names)
@@ -298,11 +298,12 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
             f"{', '.join(quantity_names)}"
         )
+    answered_names = choice_names if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
-        "quantities": tuple(quantities.get(name) for name in quantity_names),
-        "choices": tuple(choices.get(name, "") for name in choice_names) if choices else (),
+        "quantities": tuple(map(quantities.get, quantity_names)),
+        "choices": tuple(choices.get(name, "") for name in answered_names),
     }
 
 
@@ -344,12 +345,12 @@ def check_answers(answers: Answers) -> None:
             if chosen_name and choices is not None:
                 _require_choice(f"{student_mistake.kind}: {field}", chosen_name, choices)
         low, high = mistake.range
-        size_in_first_unit = student_mistake.size_in_first_unit()
-        if size_in_first_unit is not None and not low <= size_in_first_unit <= high:
-            unit, limits_text = next(iter(mistake.units)), f"{low:g} to {high:g}"
+        size = student_mistake.size_in_first_unit()
+        if size is not None and not low <= size <= high:
+            unit = next(iter(mistake.units))
             raise ValueError(
-                f"{student_mistake.kind}: size {size_in_first_unit:g} is out of range "
-                f"({limits_text} {unit})"
+                f"{student_mistake.kind}: size {size:g} is out of range ({low:g} to {high:g} "
+                f"{unit})"
             )
 
 
@@ -419,9 +420,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    for number, letter in enumerate(answers.choices, start=1):
-        if letter:
-            yield f"Answer c{number} about the figures", letter
+    letters = [f"c{number} {letter}" for number, letter in enumerate(answers.choices, 1) if letter]
+    if letters:
+        yield "Answers about the figures", ", ".join(letters)
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

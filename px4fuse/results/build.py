@@ -112,9 +112,7 @@ def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract
     )
 
 
-def loop_results(
-    request: LoopRequest, loop: Loop, student: Student = NO_STUDENT
-) -> contract.LoopResults:
+def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP_SCHEMA),

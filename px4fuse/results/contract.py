@@ -44,14 +44,14 @@ CHANGES_SCHEMA = "px4fuse-changes"
 SIGNIFICANT_DIGITS = 10
 
 
-class Log(LogInfo, frozen=True, kw_only=True):
+class Log(LogInfo, kw_only=True):
     """Log of a flight, with its other input files and the clocks mapped to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
 
 
-class AvailableTrack(Record, frozen=True):
+class AvailableTrack(Record):
     name: str
     kind: PositionKind
     path: DataPath
@@ -59,7 +59,7 @@ class AvailableTrack(Record, frozen=True):
     rate_hz: Positive | None = None
 
 
-class PositionSource(Record, frozen=True, kw_only=True):
+class PositionSource(Record, kw_only=True):
     """Position source with which KF and EKF2 are compared.
 
     ``kind`` is the type of sensor, and ``path`` states how the positions reached the log.
@@ -84,7 +84,7 @@ class PositionSource(Record, frozen=True, kw_only=True):
     alignment: Alignment | None = None
 
 
-class ChosenSettings(Record, frozen=True, kw_only=True):
+class ChosenSettings(Record, kw_only=True):
     """Settings of KF and time span; ``clock_offset_s`` was added to the source's timestamps."""
 
     sigma_a_m_s2: Positive
@@ -106,7 +106,7 @@ DiffSide = Literal["A", "B"]
 Interval = tuple[float, float | None]
 
 
-class DiffInput(Record, frozen=True, kw_only=True):
+class DiffInput(Record, kw_only=True):
     """Input A or B of ``px4fuse diff``: file name (``given``), and the log of its results."""
 
     given: str
@@ -116,7 +116,7 @@ class DiffInput(Record, frozen=True, kw_only=True):
     px4fuse: Version
 
 
-class NumberChange(Record, frozen=True, kw_only=True):
+class NumberChange(Record, kw_only=True):
     """Number that differs between the inputs A and B, with 95 % intervals if there are any.
 
     ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
@@ -132,7 +132,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
     b_interval: Interval | None = None
 
 
-class SettingChange(Record, frozen=True):
+class SettingChange(Record):
     """Setting, PX4 parameter or property of a flight that differs between the inputs A and B."""
 
     name: str
@@ -140,7 +140,7 @@ class SettingChange(Record, frozen=True):
     b: float | str | None = None
 
 
-class FindingChange(Record, frozen=True):
+class FindingChange(Record):
     """Finding that the results of only one of the inputs A and B contain."""
 
     id: str
@@ -149,7 +149,7 @@ class FindingChange(Record, frozen=True):
     only_in: DiffSide
 
 
-class _FlightResults(Record, frozen=True):
+class _FlightResults(Record):
     """Base class of the results for one flight with positions for KF."""
 
     schema: Schema
@@ -159,7 +159,7 @@ class _FlightResults(Record, frozen=True):
     settings: ChosenSettings
 
 
-class ComparisonResults(_FlightResults, frozen=True):
+class ComparisonResults(_FlightResults):
     """Results of ``px4fuse compare``, attached to its report.
 
     Attributes
@@ -200,7 +200,7 @@ class ComparisonResults(_FlightResults, frozen=True):
     convention: Convention | None = None
 
 
-class AidsResults(Record, frozen=True):
+class AidsResults(Record):
     """Results of ``px4fuse compare`` without positions for KF: EKF2's aiding sources only."""
 
     schema: Schema
@@ -214,21 +214,21 @@ class AidsResults(Record, frozen=True):
     provenance: Provenance
 
 
-class TuningResults(_FlightResults, frozen=True):
+class TuningResults(_FlightResults):
     """Results of ``px4fuse tune``: maximum-likelihood estimates of the noises, by axis."""
 
     tuning: dict[str, OrUnavailable[AxisTuning]]
     provenance: Provenance
 
 
-class SyncResults(_FlightResults, frozen=True):
+class SyncResults(_FlightResults):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
     clock: OrUnavailable[ClockOffset]
     provenance: Provenance
 
 
-class LoopResults(Record, frozen=True):
+class LoopResults(Record):
     """Results of ``px4fuse loop`` on a flight or a trajectory."""
 
     schema: Schema
@@ -241,7 +241,7 @@ class LoopResults(Record, frozen=True):
     provenance: Provenance
 
 
-class GraphResults(Record, frozen=True):
+class GraphResults(Record):
     """Results of ``px4fuse loop`` on a pose graph file."""
 
     schema: Schema
@@ -249,7 +249,7 @@ class GraphResults(Record, frozen=True):
     provenance: Provenance
 
 
-class EvaluationResults(Evaluation, frozen=True, kw_only=True):
+class EvaluationResults(Evaluation, kw_only=True):
     """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
 
     schema: Schema
@@ -258,7 +258,7 @@ class EvaluationResults(Evaluation, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class WhatIfResults(Record, frozen=True, kw_only=True):
+class WhatIfResults(Record, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
     All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the user gave no
@@ -280,7 +280,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class ChangeResults(Record, frozen=True, kw_only=True):
+class ChangeResults(Record, kw_only=True):
     """Results of ``px4fuse diff``: differences from A to B.
 
     ``worse`` has one sentence for each verdict that is worse in B; the exit code is then 1.

@@ -18,6 +18,22 @@ from px4fuse.results.model import SCHEMA_VERSION
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
+class _Schema(msgspec.Struct, frozen=True):
+    name: str
+    version: str
+
+
+class _Writer(msgspec.Struct, frozen=True):
+    px4fuse: str = "of that schema version"
+
+
+class _Head(msgspec.Struct, frozen=True):
+    """Fields that results of all versions of the schema contain."""
+
+    schema: _Schema
+    provenance: _Writer = _Writer()
+
+
 def read_results(data: bytes, name: str = "results.json") -> Results:
     """Read results of px4fuse from untrusted bytes; ``name`` is the file name for messages.
 
@@ -40,17 +56,14 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
-    schema = decoded.get("schema") if isinstance(decoded, dict) else None
-    results_type = (
-        RESULTS_BY_SCHEMA.get(str(schema.get("name"))) if isinstance(schema, dict) else None
-    )
-    if schema is None or results_type is None:
-        raise ResultsError(f"{name} contains no results of px4fuse.")
-    version, (major, minor) = str(schema.get("version")), SCHEMA_VERSION.split(".")
+    try:
+        head = msgspec.convert(decoded, _Head)
+        results_type = RESULTS_BY_SCHEMA[head.schema.name]
+    except (msgspec.ValidationError, KeyError) as error:
+        raise ResultsError(f"{name} contains no results of px4fuse.") from error
+    version, (major, minor) = head.schema.version, SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        provenance = decoded.get("provenance")
-        writer_version = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader_version = one_line(str(writer_version or "of that schema version"), 60)
+        reader_version = one_line(head.provenance.px4fuse, 60)
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with px4fuse {reader_version}.",

@@ -10,7 +10,7 @@ and prints the mean points (of 100) of each strategy:
 - random, and the best constant form of :mod:`form_guesses`
 
 These strategies guess the fault of each figure, and give the answers of figures.toml for it.
-``--students 300`` needs an hour on two cores.
+``--students 300`` needs 20 minutes of processor time.
 """
 
 from __future__ import annotations

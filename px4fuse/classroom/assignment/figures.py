@@ -37,7 +37,7 @@ QUESTIONS = {
 }
 
 
-class FigureFault(Record, frozen=True):
+class FigureFault(Record):
     """Injected fault of a flight in a figure (``figures.toml``), and right answers about it.
 
     ``option`` is the value of ``px4fuse simulate --mistake``, or "" without a fault.
@@ -51,7 +51,7 @@ class FigureFault(Record, frozen=True):
     option: str = ""
 
 
-FAULTS = read_toml(__file__, dict[str, FigureFault], "figures.toml")
+FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
 def _shuffle(names: Iterable[str], label: str, draw_number: Callable[[str], float]) -> list[str]:

@@ -46,7 +46,7 @@ EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 UNDETECTABLE_FRACTION, UNDETECTABLE_DIFFICULTY = 0.25, 1.5
 
 
-class AssignableMistake(Record, frozen=True):
+class AssignableMistake(Record):
     """Injected fault of a simulated flight that can be assigned to a student.
 
     Attributes
@@ -99,7 +99,7 @@ class AssignableMistake(Record, frozen=True):
         return f"{text},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
 
 
-class DrawingRules(Record, frozen=True):
+class DrawingRules(Record):
     """Possible injected faults of a kind of flight, and ranges of random numbers (``drawn.toml``).
 
     ``numbers`` are minimum, maximum and decimals, by field of the scenario.

@@ -50,7 +50,7 @@ IGNORED_RESETS_S = 5.0
 BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
-class TrueMistake(Record, frozen=True):
+class TrueMistake(Record):
     """Injected fault of a simulated flight, with the limits of right answers.
 
     Attributes
@@ -71,7 +71,7 @@ class TrueMistake(Record, frozen=True):
     until_s: float | None = None
 
 
-class VerdictTruth(Record, frozen=True):
+class VerdictTruth(Record):
     """Right verdict on the reported σ of a filter, and the factor by which σ is wrong.
 
     ``verdict`` is "" if the flight has too few data for a verdict.
@@ -81,7 +81,7 @@ class VerdictTruth(Record, frozen=True):
     factor: float | None = None
 
 
-class FormTruth(Record, frozen=True):
+class FormTruth(Record):
     """Right answers to the answer form about one flight.
 
     Attributes

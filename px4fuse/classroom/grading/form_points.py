@@ -8,6 +8,7 @@ guessed without a measurement has points only with the correct size.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import NamedTuple
 
 import msgspec
@@ -22,6 +23,7 @@ from px4fuse.results.answer_form import (
     Answers,
     QuantityAnswer,
     StudentMistake,
+    draw_questions,
 )
 
 # Fraction of the points for the diagnosis if the answer key has choices: a student can copy the
@@ -124,7 +126,7 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     is_named_by_kind = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
     feedback = (
         *_mistake_feedback(matches, false_mistakes, is_no_mistake_right),
-        *_choice_feedback(answers, truth),
+        *_answer_feedback(answers, truth),
     )
     return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
 
@@ -165,16 +167,33 @@ def describe_right_answer(mistake: TrueMistake) -> str:
     return ", ".join([*texts, f"shown in {' or '.join(panels_showing(mistake.kind))}"])
 
 
-def _choice_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
-    """Yield a clause with the right answer to each question about figures that is not right."""
-    given_letters = dict(enumerate(answers.choices))
-    for index, (choice, right_letter) in enumerate(truth.choices):
-        given_letter = given_letters.get(index) or "none"
-        if given_letter != right_letter:
-            yield (
-                f"{choice.question}: {right_letter} is right ({choice.answer_text(right_letter)}), "
-                f"you gave {given_letter}"
-            )
+def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
+    """Yield a clause with the right answer to each further question that is not answered right."""
+    rows: list[tuple[str, object, object]] = [
+        ("verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
+        ("verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
+    ]
+    if _ekf2_behaviour_fraction(answers, truth) < 1.0:
+        rows.append(("behaviour of EKF2", answers.ekf2_did, truth.ekf2_did))
+    for question, given, right in zip_longest(
+        draw_questions(answers.log_sha256), answers.quantities, truth.quantities
+    ):
+        if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
+            rows.append((f"{question.text}, within {FULL_POINTS_TOLERANCE:.0%}", given, right))
+    for letter, (choice, right_letter) in zip_longest(
+        answers.choices[: len(truth.choices)], truth.choices
+    ):
+        given_text = choice.answer_text(letter) if letter else ""
+        rows.append((choice.question, given_text, choice.answer_text(right_letter)))
+    for name, given, right in rows:
+        if given != right:
+            yield f"{name}: {_format_answer(right)} is right, you gave {_format_answer(given)}"
+
+
+def _format_answer(answer: object) -> str:
+    if isinstance(answer, tuple):
+        return ", ".join(map(_format_answer, answer)) or "none"
+    return f"{answer:.4g}" if isinstance(answer, float | int) else f"'{answer or 'none'}'"
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
