@@ -231,24 +231,14 @@ class HeightFilter:
 
     def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
-            if self.any_sample[slot][e]:
-                age_s = self.age_s[slot, e]
-                column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
-                predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
-                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
-                x, P = self._fuse_innovation(
-                    e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
-                )
+            x, P = self._fuse_sample(
+                e, slot, x, P, self.down_m[slot, e], self.age_s[slot, e], self.noise_m2
+            )
         return x, P
 
     def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
         """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
-        if self.any_sample[-1][e]:
-            column = P[:, :, DOWN]
-            nu = gnss_m - x[:, DOWN]
-            slot = len(self.down_m)
-            x, P = self._fuse_innovation(e, slot, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
-        return x, P
+        return self._fuse_sample(e, len(self.down_m), x, P, gnss_m, np.zeros(1), gnss_m2)
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]
@@ -257,19 +247,17 @@ class HeightFilter:
             ratios[:, -2] = np.fmax(ratios[:, -2], ratios[:, -1])
             self.bad_acceleration.update(time_s, ratios[0, :-1], ratios[-1, :-1])
 
-    def _fuse_innovation(
-        self,
-        e: int,
-        slot: int,
-        sensor_index: int,
-        x: Array,
-        P: Array,
-        column: Array,
-        predicted_variance: Array,
-        nu: Array,
-        R: Array,
+    def _fuse_sample(
+        self, e: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
     ) -> ArrayPair:
-        """Fuse one height innovation ``nu``; ``column`` is PH', ``predicted_variance`` HPH'."""
+        """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
+        if not self.any_sample[slot][e]:
+            return x, P
+        sensor_index = int(slot == len(self.down_m))
+        # PH' and HPH'
+        column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
+        nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[slot][e]
         if self.biased[sensor_index]:
             nu, R = self.bias.remove_bias(

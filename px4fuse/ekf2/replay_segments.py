@@ -504,9 +504,7 @@ def _make_segment(
     nominal_attitude = multiply(extra_rotation, gyro_attitude)
     state_times_s, state_rotation = relative_attitude(fusion_record.delayed, 1e-4, nominal_attitude)
     attitude_error_rad = to_vector(state_rotation)
-    published_m = [
-        np.interp(step_times_s[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION
-    ]
+    published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_m)
     # from PX4 v1.16 on, the height of the state has another origin than the published height
@@ -522,19 +520,13 @@ def _make_segment(
             [attitude_error_rad[0], initial_row[Columns.VELOCITY], position_m, np.zeros(6)]
         ),
         variance=np.asarray(initial_row[Columns.DELAYED_VARIANCE[:15]]),
-        down_m=_interpolate(ekf2.state["down_m"], step_times_s),
-        attitude_variance_rad2=np.column_stack(
-            [
-                _interpolate(fusion_record.delayed[name], step_times_s)
-                for name in Columns.DELAYED_VARIANCE[:3]
-            ]
+        down_m=_interpolate(ekf2.state[["down_m"]], step_times_s)[:, 0],
+        attitude_variance_rad2=_interpolate(
+            fusion_record.delayed[Columns.DELAYED_VARIANCE[:3]], step_times_s
         ),
-        down_variance_m2=_interpolate(fusion_record.delayed["down_m2"], step_times_s),
-        attitude_error_rad=np.column_stack(
-            [
-                np.interp(step_times_s, state_times_s, component)
-                for component in attitude_error_rad.T
-            ]
+        down_variance_m2=_interpolate(fusion_record.delayed[["down_m2"]], step_times_s)[:, 0],
+        attitude_error_rad=_interpolate(
+            pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
         ),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
@@ -608,9 +600,7 @@ def _mean_field(
     )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
     earth, body = (
-        np.column_stack(
-            [np.interp(measured_at_s, delayed_state.index, delayed_state[name]) for name in names]
-        )
+        _interpolate(delayed_state[names], measured_at_s)
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
     rotated_earth_field = earth[:, None] - np.cross(
@@ -696,8 +686,9 @@ def predict_s(fusion_record: FusionRecord) -> float:
     return fusion_record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
-def _interpolate(series: pd.Series, times_s: Array) -> Array:
-    return np.asarray(np.interp(times_s, series.index, series))
+def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
+    """Interpolate the columns of a table, indexed by time (s)."""
+    return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
 
 
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
