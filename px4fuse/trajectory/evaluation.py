@@ -24,6 +24,7 @@ from px4fuse.trajectory.artefacts import (
     LEVER_ARM_ITERATIONS,
     drop_constant_orientation,
     find_frozen_poses,
+    find_jumps,
     has_other_body_axes,
 )
 from px4fuse.trajectory.association import Association, Method, associate
@@ -160,6 +161,7 @@ def evaluate(
     transform, line_warnings = _fit_or_approximate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
+    jump_warnings = find_jumps(matched_estimate, matched_reference)
     aligned_estimate = matched_estimate.with_positions(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
@@ -213,11 +215,16 @@ def evaluate(
         notes=(*constant_notes[0], *constant_notes[1], *notes),
         warnings=(
             *frozen_warnings,
+            *jump_warnings,
             *line_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
             *_comparison_warnings(
-                matched_estimate, matched_reference, association_result, alignment
+                matched_estimate,
+                matched_reference,
+                association_result,
+                alignment,
+                has_jumps=bool(jump_warnings),
             ),
         ),
     )
@@ -339,7 +346,12 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
 
 
 def _comparison_warnings(
-    estimate: Trajectory, reference: Trajectory, association: Association, alignment: AlignmentKind
+    estimate: Trajectory,
+    reference: Trajectory,
+    association: Association,
+    alignment: AlignmentKind,
+    *,
+    has_jumps: bool,
 ) -> Iterator[str]:
     if association.coverage_estimate < MIN_COVERAGE:
         yield (
@@ -351,6 +363,8 @@ def _comparison_warnings(
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
+    if has_jumps:  # a jump changes the scale of the best fit
+        return
     # fit_alignment would raise an error if the motion does not determine the rotation
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
     has_motion = np.ptp(reference.position_m, axis=0).any()
