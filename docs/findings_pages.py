@@ -38,7 +38,7 @@ from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis  # noqa: E402
-from px4fuse.diagnose import explain  # noqa: E402
+from px4fuse.diagnose import find_faults  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
@@ -114,7 +114,7 @@ def examples() -> dict[str, Example]:
 
     for name, (faults, settings) in SIMULATED.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_mistakes(faults))
-        analysis = explain(compare(flight, Settings(**settings)))
+        analysis = find_faults(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
         settings_text = f", analysed with `compare {' '.join(options)}`" if options else ""
@@ -129,7 +129,9 @@ def examples() -> dict[str, Example]:
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
-        analysis = explain(compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings()))
+        analysis = find_faults(
+            compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
+        )
         findings = [finding for finding in find(analysis) if finding.id.startswith("source_")]
         add_examples(
             findings,

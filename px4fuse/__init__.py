@@ -11,23 +11,23 @@ import typing as _typing
 
 # Module of each public name; a module is imported at first use, so that ``px4fuse --help`` is fast
 _MODULES = {
-    "Analysis": "px4fuse.analysis",
-    "Px4FuseError": "px4fuse.errors",
-    "Settings": "px4fuse.filter.settings",
-    "Unavailable": "px4fuse.core.record",
-    "run_batch": "px4fuse.batch.run",
-    "close_loop": "px4fuse.api",
-    "compare": "px4fuse.api",
-    "diff": "px4fuse.batch.changes",
-    "evaluate": "px4fuse.api",
-    "find": "px4fuse.findings",
-    "read_log": "px4fuse.readers",
-    "read_trajectory": "px4fuse.readers.trajectory",
-    "replay": "px4fuse.filter.kalman",
-    "table": "px4fuse.api",
-    "what_if": "px4fuse.api",
-    "write_page": "px4fuse.api",
-    "write_report": "px4fuse.api",
+    "Analysis": "analysis",
+    "Px4FuseError": "errors",
+    "Settings": "filter.settings",
+    "Unavailable": "core.record",
+    "run_batch": "batch.run",
+    "close_loop": "api",
+    "compare": "api",
+    "diff": "batch.changes",
+    "evaluate": "api",
+    "find": "findings",
+    "read_log": "readers",
+    "read_trajectory": "readers.trajectory",
+    "replay": "filter.kalman",
+    "table": "api",
+    "what_if": "api",
+    "write_page": "api",
+    "write_report": "api",
 }
 __all__ = list(_MODULES)
 
@@ -58,6 +58,6 @@ else:
         """Import a public name at its first use."""
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(_importlib.import_module(_MODULES[name]), name)
+        value = getattr(_importlib.import_module(f"px4fuse.{_MODULES[name]}"), name)
         globals()[name] = value
         return value

@@ -8,7 +8,7 @@ from px4fuse.comparison.flight_events import Events
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.reruns import Reruns
 from px4fuse.comparison.trials import Trial
-from px4fuse.core.notebook_display import display_html, one_line_repr
+from px4fuse.core.record import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation

@@ -10,13 +10,13 @@ from msgspec import structs
 from px4fuse import request
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
-from px4fuse.core.notebook_display import display_html
+from px4fuse.core.record import display_html
 from px4fuse.core.writing import write_all
-from px4fuse.diagnose import diagnose, run_what_if
+from px4fuse.diagnose import diagnose, require_available, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import MissingDataError, OutputError, SettingsError
+from px4fuse.errors import OutputError, SettingsError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
@@ -28,21 +28,21 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() with their data types
-COLUMNS = {
-    "count": "Int64",
-    "nis_mean": "float64",
-    "nis_low": "float64",
-    "nis_high": "float64",
-    "verdict": "object",
-    "sigma_ratio": "float64",
-    "innovation_std_m": "float64",
-    "sqrt_s_median_m": "float64",
-    "sigma_p_median_m": "float64",
-    "position_rmse_m": "float64",
-    "velocity_rmse_m_s": "float64",
-    "nees_position_mean": "float64",
-}
+# Columns of table(); they contain floats, except for "count" and "verdict"
+COLUMNS = (
+    "count",
+    "nis_mean",
+    "nis_low",
+    "nis_high",
+    "verdict",
+    "sigma_ratio",
+    "innovation_std_m",
+    "sqrt_s_median_m",
+    "sigma_p_median_m",
+    "position_rmse_m",
+    "velocity_rmse_m_s",
+    "nees_position_mean",
+)
 
 
 def compare(
@@ -145,7 +145,8 @@ def table(analysis: Analysis) -> pd.DataFrame:
         for filter_name, summary in axis.filters.items()
     }
     index = pd.MultiIndex.from_tuples(rows, names=["axis", "filter"])
-    return pd.DataFrame(list(rows.values()), index, list(COLUMNS)).astype(COLUMNS)
+    types = dict.fromkeys(COLUMNS, "float64") | {"count": "Int64", "verdict": "object"}
+    return pd.DataFrame(list(rows.values()), index, COLUMNS).astype(types)
 
 
 def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
@@ -333,12 +334,7 @@ def what_if(
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
+    model = require_available(open_model(flight), flight)
     changes = {} if changes is None else changes
     settings = [changes] if isinstance(changes, Mapping) else changes
-    replays = whatif.what_if(model, settings, without)
-    if isinstance(replays, Unavailable):
-        raise MissingDataError(f"{replays.what}: {replays.reason}", replays.remedy)
-    return replays
+    return require_available(whatif.what_if(model, settings, without), flight)

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec import structs
 
@@ -32,7 +32,7 @@ from px4fuse.comparison.estimates import (
     ignore_progress,
 )
 from px4fuse.comparison.flight_events import collect_events
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
@@ -48,11 +48,12 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
-from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
+
+Result = TypeVar("Result")
 
 
 def diagnose(
@@ -62,7 +63,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, explain the differences and find faults.
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 7).
 
     Parameters
     ----------
@@ -83,11 +84,11 @@ def diagnose(
     prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
     kf_runs = run_kf(prepared, progress)
     comparison = compare(prepared, kf_runs)
-    return replace(explain(comparison, progress), request=request)
+    return replace(find_faults(comparison, progress), request=request)
 
 
-def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Explain a comparison: estimate errors, re-run the filters without each error, find faults.
+def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Find the faults of a flight (steps 5 to 7): estimate errors, re-run filters, find causes.
 
     For a flight that is an assignment, the result contains only the comparison.
     """
@@ -150,7 +151,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log_path = Path(request.log)
     progress(f"reading {display_name(log_path)}")
     flight = read_log(log_path, system=request.system)
-    requested_file, requested_offset = request.position, request.clock_offset_s
+    requested_file, offset_s = request.position, request.clock_offset_s
     if requested_file is None:
         return flight
     # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
@@ -164,13 +165,12 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
         time_unit=requested_file.time_unit,
         length_unit=requested_file.length_unit,
     )
-    clock_offset_s = None if isinstance(requested_offset, str) else requested_offset
     return align_position_file(
         flight,
         position_file,
         frame=requested_file.frame,
         yaw_deg=requested_file.yaw_deg,
-        clock_offset_s=clock_offset_s,
+        clock_offset_s=None if isinstance(offset_s, str) else offset_s,
     )
 
 
@@ -180,7 +180,7 @@ def prepare_comparison(
     flight: Flight | None = None,
     *,
     as_sent: bool = False,
-) -> Comparison:
+) -> PreparedComparison:
     """Choose position source, time span, axes and time offset of a flight, before KF runs.
 
     Arguments and errors are those of :func:`diagnose`.
@@ -240,8 +240,7 @@ def diagnose_or_check_aids(
         See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
     """
     flight = flight or read_flight(request, progress)
-    has_named_source = request.position_source is not None
-    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
+    if request.position_source or any(track.origin.is_automatic for track in flight.positions):
         return diagnose(request, progress, flight)
     no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
@@ -270,9 +269,10 @@ def run_what_if(
         the log, or a parameter is unknown or out of PX4's range.
     """
     changes, sweep = check_parameters(request.changes), request.sweep
-    swept_values: list[float] = []
+    swept_settings: list[dict[str, float]] = []
     if sweep is not None:
-        swept_values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        swept_settings = [{sweep.parameter: value} for value in values]
         if sweep.parameter in changes:
             raise SettingsError(
                 f"{sweep.parameter} has both a new value and a sweep.",
@@ -286,9 +286,7 @@ def run_what_if(
             f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
         )
     progress("replaying EKF2")
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
+    model = require_available(open_model(flight), flight)
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:
@@ -306,18 +304,26 @@ def run_what_if(
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []
-    parameter_sets += (
-        [{**changes, sweep.parameter: value} for value in swept_values] if sweep else []
-    )
+    parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
-    replays = what_if(model, parameter_sets, request.without)
-    if isinstance(replays, Unavailable):
-        raise MissingDataError(
-            f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
-        )
+    replays = require_available(what_if(model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
         flight, replays, changes, is_default_change, difference_steps, request.without
     )
+
+
+def require_available(result: Result | Unavailable, flight: Flight) -> Result:
+    """Return a result.
+
+    Raises
+    ------
+    MissingDataError
+        The result is unavailable.
+    """
+    if isinstance(result, Unavailable):
+        reason = f"{flight.log.name}: {result.what}: {result.reason}"
+        raise MissingDataError(reason, result.remedy)
+    return result
 
 
 def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:

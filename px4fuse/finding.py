@@ -13,7 +13,7 @@ MAX_LISTED_SPANS = 3  # maximum number of printed time spans; more are printed a
 MIN_SPAN_S = 0.05  # minimum duration (s) of a span; a shorter span is printed as one time
 
 
-class Finding(Record, frozen=True, omit_defaults=False):
+class Finding(Record, omit_defaults=False):
     """Fault or condition of a flight that the log shows.
 
     Attributes

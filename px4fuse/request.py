@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
+from px4fuse.core.text import replace_unencodable
+
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF: process noise, measurement noise and prediction interval
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
@@ -29,7 +31,26 @@ FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
-class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+# Fields of requests that contain a path
+_PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
+
+
+class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base class of all requests and of the position file."""
+
+    def without_paths(self) -> Self:
+        """Return the request with file names instead of paths, as the results contain it."""
+        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
+        changes: dict[str, Any] = {
+            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
+        }
+        position = getattr(self, "position", None)
+        if position is not None:
+            changes["position"] = position.without_paths()
+        return msgspec.structs.replace(self, **changes)
+
+
+class PositionFile(_BaseRequest, frozen=True, kw_only=True):
     """Recording of the positioning system, with its frame, columns and units.
 
     Attributes
@@ -56,25 +77,6 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     columns: tuple[str, ...] | None = None
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     length_unit: Literal["m", "cm", "mm"] | None = None
-
-
-# Fields of requests that contain a path
-_PATH_FIELDS = ("log", "source", "estimate", "reference")
-
-
-class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of all requests."""
-
-    def without_paths(self) -> Self:
-        """Return the request with file names instead of paths, as the results contain it."""
-        paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
-        changes: dict[str, Any] = {
-            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
-        }
-        position = getattr(self, "position", None)
-        if position is not None:
-            changes["position"] = msgspec.structs.replace(position, path=_file_name(position.path))
-        return msgspec.structs.replace(self, **changes)
 
 
 class ComparisonRequest(
@@ -231,6 +233,8 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
+# Unit of the numbers in a field, by the end of its name
+SUFFIX_UNITS = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 _POSITION_OPTIONS = {
     "path": "--position",
     "body": "--body",
@@ -250,7 +254,7 @@ def _option_names(
     An option is the field name with hyphens and without unit, except for ``renamed_options``.
     """
     option_names = {
-        field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
+        field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(request_type)
         if not field.required and field.name not in excluded
     }
@@ -375,4 +379,4 @@ def _file_name(path: str) -> str:
     Bytes that are not UTF-8 become question marks.
     """
     file, topic, _ = re.split(r"((?<=..):/.*|$)", path, maxsplit=1, flags=re.DOTALL)
-    return PurePath(file).name.encode(errors="replace").decode() + topic
+    return replace_unencodable(PurePath(file).name) + topic

@@ -3,7 +3,7 @@
 from typing import Any
 
 from px4fuse.comparison import comparison, preparation
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
 from px4fuse.request import ComparisonRequest
@@ -19,7 +19,7 @@ def request_of(settings: Settings | None = None, **choices: Any) -> ComparisonRe
 
 def prepare(
     flight: Flight, settings: Settings | None = None, *, as_sent: bool = False, **choices: Any
-) -> Comparison:
+) -> PreparedComparison:
     return preparation.prepare(flight, request_of(settings, **choices), as_sent=as_sent)
 
 
@@ -27,5 +27,5 @@ def compare(flight: Flight, settings: Settings | None = None, **choices: Any) ->
     return compare_prepared(prepare(flight, settings, **choices))
 
 
-def compare_prepared(prepared: Comparison) -> Comparison:
+def compare_prepared(prepared: PreparedComparison) -> Comparison:
     return comparison.compare(prepared, comparison.run_kf(prepared))

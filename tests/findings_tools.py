@@ -21,8 +21,7 @@ from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import NO_INVALID_ROWS, RECEIVED, Columns, Ekf2, FusionRecord, Unavailable
 
 T = TypeVar("T")
 
@@ -131,8 +130,8 @@ def analysis(
     by_name = {each.axis.name: each for each in axes}
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
-        main=next(iter(axes), axis()), lines=tuple(each.axis for each in axes), segment=SEGMENT,
-        settings=settings, notes=notes, missing=missing,
+        main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
+        segment=SEGMENT, settings=settings, notes=notes, missing=missing,
         **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
         main_trials=[t for t in parts.get("trials", ()) if t.kinds],
     )  # fmt: skip

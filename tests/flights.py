@@ -24,19 +24,21 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
-from px4fuse.flight.log import Dropout, LogInfo
 from px4fuse.flight.model import (
     AXIS_NAMES,
+    RECEIVED,
     Alignment,
     Columns,
+    Dropout,
     Ekf2,
     Flight,
+    LogInfo,
+    Origin,
     PositionTrack,
     Reset,
     Truth,
     Unavailable,
 )
-from px4fuse.flight.position_source import RECEIVED, Origin
 
 Span = tuple[float, float]
 

@@ -19,9 +19,15 @@ from px4fuse.alignment.placement import align_position_file
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.log import InputFile
-from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Reset
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Alignment,
+    Columns,
+    Flight,
+    InputFile,
+    PositionTrack,
+    Reset,
+)
 from px4fuse.readers import read_log
 from px4fuse.readers.position_file import SAMPLE_COLUMNS, PositionRecording, read_position_file
 

@@ -24,11 +24,13 @@ from px4fuse.classroom.assignment.random_assignment import (
     LOOP_FRACTION,
     MISTAKE_COUNT_FRACTIONS,
     RULES_BY_KIND,
+    UNDETECTABLE_DIFFICULTY,
+    UNDETECTABLE_FRACTION,
     derive_key,
     draw,
 )
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop
 from px4fuse.loop.analysis import analyse
@@ -39,7 +41,7 @@ from px4fuse.simulation.mistakes import parse_mistakes
 
 SECRET = b"a secret for tests"
 # Flight of student s1 with SECRET: seed, noise and heading, and the faults
-PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
+PINNED = ((60177528313411211811171476757776911151, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 # Finding that reports each fault
 FINDINGS = {
@@ -140,7 +142,7 @@ class TestDraw:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
                     assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
-            assert EASIEST_DIFFICULTY <= drawn.difficulty <= HARDEST_DIFFICULTY
+            assert EASIEST_DIFFICULTY <= drawn.difficulty <= UNDETECTABLE_DIFFICULTY
         both = {
             choice.mistake for choice in RULES_BY_KIND["aisle"].mistakes if choice.has_either_sign
         }
@@ -168,11 +170,17 @@ class TestDraw:
     def test_assigned_flights_cover_full_range_of_difficulty(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
-        assert counts.min() > 90
+        assert counts.min() > 65
+        undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
+        assert undetectable_count / len(each) == pytest.approx(UNDETECTABLE_FRACTION, abs=0.06)
+
+    def test_assigned_flight_seeds_have_128_bits(self):
+        seeds = [draw(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
+        assert max(seeds).bit_length() == 128
 
 
 @pytest.mark.parametrize(
-    ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
+    ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 2, 2), ("aisle", 2, 1), ("loop", 1, 1)]
 )
 def test_each_fault_in_assigned_log_is_detected_by_analysis(
     tmp_path, monkeypatch, kind, number, count
@@ -186,7 +194,7 @@ def test_each_fault_in_assigned_log_is_detected_by_analysis(
     if kind == "loop":
         found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
-        found = explain(compare(flight, axes=("north", "east"))).findings
+        found = find_faults(compare(flight, axes=("north", "east"))).findings
     drawn = draw(SECRET, CLASS[number].student_id, kind, count)
     wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count
@@ -212,12 +220,14 @@ class TestAssign:
         assert not key.secret
         assert SECRET.decode() not in key_file.read_text(encoding="utf-8")
         logs = files(folder)
-        assert set(logs) == {f"s0{n}.{end}" for n in range(3) for end in ("ulg", "answers.toml")}
+        assert set(logs) == {
+            f"s0{n}.{end}" for n in range(3) for end in ("ulg", "answers.toml", "png")
+        }
         for answer in key.answers:
             assert hashlib.sha256(logs[answer.file]).hexdigest() == answer.sha256
             assert len(answer.mistakes) == 2
             assert answer.truth["sigma_z_m"] == answer.scenario["sigma_uwb_m"]
-        assert len(set(logs.values())) == 6
+        assert len(set(logs.values())) == 9
         form = read_answers(folder / "s00.answers.toml")
         assert form == Answers(log_sha256=key.answers[0].sha256, quantities=(None,) * 3)
         assert len(key.answers[0].form.mistakes) == 2

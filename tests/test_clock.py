@@ -46,13 +46,15 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.likelihood import profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, ClockOffset, PartOffset
-from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.flight.position_source import (
+from px4fuse.flight.model import (
     ALIGNED,
     GNSS,
     LOGGED_BY_EKF2,
     MOTION_CAPTURE,
     POSITION_FILE,
+    Columns,
+    Flight,
+    Unavailable,
     with_orientation,
 )
 from px4fuse.report.clock import clock_advice

@@ -221,8 +221,8 @@ class TestMissingParts:
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")
         assert any("KF assumes constant velocity" in note for note in comparison.notes)
-        assert isinstance(comparison.lines[0].acceleration, Unavailable)
-        assert comparison.lines[0].acceleration in comparison.missing
+        assert isinstance(comparison.input_axes[0].acceleration, Unavailable)
+        assert comparison.input_axes[0].acceleration in comparison.missing
         assert comparison.main.filters["kf"].count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
             prepare(flight, input="imu")

@@ -24,8 +24,7 @@ from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import Columns, Flight, PositionTrack
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, Columns, Flight, PositionTrack
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse_mistakes

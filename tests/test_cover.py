@@ -119,8 +119,7 @@ def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     )  # fmt: skip
     marked = [replace(each, interval=(each.ratio, 2.0 * each.ratio)) for each in ratios]
     (block,) = page_of(replace(SMALL_SIGMA_A, verdicts=tuple(marked))).blocks
-    assert [row["beyond"] for row in block["rows"]] == [-1, 0, 0, 1]
-    assert block["rows"][0]["interval"] is None
+    assert [row["mark"] for row in block["rows"]] == ["below", "truth", "source", "above"]
     assert block["rows"][2]["interval"] == [1.0, 1.0]
 
 
@@ -233,7 +232,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
 def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
-        section.panel("Panel", "", 210.0)
+        section.panel("Panel", 210.0)
     sheets = set_by_typst(*sections)
     assert [sheet.count("Section") for sheet in sheets] == [2, 2]
     assert [sheet.count("Panel") for sheet in sheets] == [2, 2]

@@ -11,7 +11,7 @@ from msgspec import structs
 from px4fuse.batch.changes import compare_numbers, list_changes
 from px4fuse.batch.inputs import InputResults
 from px4fuse.batch.measures import MEASURES, ComparedNumber, collect_numbers
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
@@ -57,7 +57,7 @@ def flown(seed: int, *mistakes: str, **scenario) -> InputResults:
     request = ComparisonRequest(
         log="f.ulg", sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
-    found = results(request, explain(compare(flight, RIGHT)))
+    found = results(request, find_faults(compare(flight, RIGHT)))
     return as_input(read_results(to_json(found).encode()))
 
 

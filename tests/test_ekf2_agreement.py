@@ -14,14 +14,13 @@ from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
     CONSTANT_INNOVATIONS,
-    VELOCITY_UPDATE_COLUMNS,
     Agreement,
     AxisAgreement,
     Ekf2Replay,
     _agreement_verdict,
     _axis_agreement,
-    _compare_velocity,
     _heading_error_deg,
+    _other_agreements,
     agreement_with_log,
     inside_spans,
     logged_innovations,
@@ -162,12 +161,17 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
 def test_correlation_of_constant_innovations_is_unavailable():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
-    updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
-    columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in ["north", "east"]]
-    samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
-    ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
-    replay = SimpleNamespace(updates=updates, evaluated_s=((0.0, 99.0),), other_aid_updates={})
-    assert _compare_velocity(ekf2, replay, is_own_topic=True) == CONSTANT_INNOVATIONS
+    columns = ["innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
+               "innovation_variance_east_m2", "rejected"]  # fmt: skip
+    updates = pd.DataFrame(0.1, index=index, columns=columns)
+    axes = ("north", "east")
+    columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in axes]
+    samples = pd.DataFrame(0.1, index=index, columns=columns)
+    log = made(AidLog, samples=samples, axes=axes, topics=("estimator_aid_src_gnss_vel",),
+               parameters={})  # fmt: skip
+    ekf2 = made(Ekf2, aids={"gnss_vel": log})
+    replay = SimpleNamespace(evaluated_s=((0.0, 99.0),), other_aid_updates={"gnss_vel": updates})
+    assert _other_agreements(ekf2, replay) == ({}, {"gnss_vel": CONSTANT_INNOVATIONS})
 
 
 def test_ekf2_replay_heading_error_without_logged_state_is_none():

@@ -45,24 +45,22 @@ from px4fuse.flight.ekf2_parameters import (
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
-    DEAD_RECKONING,
-    AidLog,
-    Columns,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    PositionTrack,
-    Reset,
-    Unavailable,
-)
-from px4fuse.flight.position_source import (
     ALIGNED,
+    DEAD_RECKONING,
     GNSS,
     LOGGED_BY_EKF2,
     MOTION_CAPTURE,
     POSITION_FILE,
     RECEIVED,
+    AidLog,
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
     Origin,
+    PositionTrack,
+    Reset,
+    Unavailable,
 )
 from px4fuse.trajectory.rotation import to_matrix
 

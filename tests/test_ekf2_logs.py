@@ -31,7 +31,7 @@ def test_ekf2_replay_benchmark_matches_documented_numbers(shared_logs, model_of,
     models = bench_ekf2.agreement_table(paths)
     assert {path.stem for path in paths} - models.keys() == {*NOT_CARRIED, *GNSS_NOT_CARRIED}
     left = bench_ekf2.waterfalls(models)
-    bench_ekf2.counterfactuals(models)
+    bench_ekf2.check_what_if(models)
     assert bench_ekf2.agreement_page(models, left) == bench_ekf2.in_page()
 
 

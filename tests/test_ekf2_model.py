@@ -18,8 +18,7 @@ from px4fuse.ekf2.model import (
     run_configurations,
 )
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, Flight, Unavailable
 from px4fuse.readers import read_log
 
 

@@ -306,6 +306,17 @@ def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
     assert done.state[-1, 0, 6] > 0.02
 
 
+def test_magnetometer_noise_is_at_least_0_01_gauss():
+    """The limit is in mag_control.cpp."""
+    low, limit, high = (
+        at_rest([0.0] * 20, aid=GNSS_POS, rules=GNSS_RULES, heading_rad=0.05,
+                field_gauss=(0.21, 0.0, 0.43), EKF2_MAG_NOISE=noise_gauss)
+        for noise_gauss in (0.0, 0.01, 0.02)
+    )  # fmt: skip
+    np.testing.assert_allclose(low.state, limit.state, atol=1e-5)
+    assert np.abs(high.state - limit.state).max() > 1e-4
+
+
 def at_rest(
     measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,

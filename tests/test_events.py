@@ -9,8 +9,7 @@ from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.comparison.flight_events import collect_events, source_gaps
-from px4fuse.flight.log import Dropout
-from px4fuse.flight.model import Reset, Unavailable
+from px4fuse.flight.model import Dropout, Reset, Unavailable
 
 
 def test_detected_position_gaps_exceed_1_s_and_five_intervals() -> None:

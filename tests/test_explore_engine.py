@@ -72,11 +72,7 @@ def in_browser(
 ) -> list[dict[str, dict[str, list[float]]]]:
     packer = Packer()
     flight = replay_signals(comparison, packer)
-    tries_for_page = [
-        (at, {"sigmaA": one.sigma_a_m_s2, "sigmaZ": one.sigma_z_m, "dt": one.dt_s,
-              "input": one.input, "offset": one.clock_offset_s})
-        for at, one in tries
-    ]  # fmt: skip
+    tries_for_page = [(at, asdict(settings)) for at, settings in tries]
     values = {
         "text": packer.text(), "specs": packer.array_specs, "flight": json.dumps(flight),
         "tries": tries_for_page,
@@ -178,6 +174,6 @@ def test_javascript_kf_with_too_few_measurements_returns_null(engine: Browser) -
     flight = replay_signals(comparison, packer)
     flight["segment"] = [flight["segment"][0], flight["segment"][0] + 0.05]
     flight["axes"] = [{"time": [0.0, 1.0, 2.0], "z": [0.0, 0.0, 0.0]}]
-    settings = {"sigmaA": 0.5, "sigmaZ": 0.1, "dt": 0.1, "input": "zero", "offset": 0.0}
+    settings = asdict(Settings(input="zero"))
     script = f"Engine.replay({json.dumps(flight)}, {json.dumps(flight['axes'][0])}, "
     assert ask(engine, f"{script}{json.dumps(settings)})") is None

@@ -90,7 +90,7 @@ def test_explore_page_on_phone_fits_diagnosis_and_plot(
 
 
 def test_explore_page_marks_innovations_outside_plot_at_edge(page: Browser) -> None:
-    put(page, sigmaA=0.002)
+    put(page, sigma_a_m_s2=0.002)
 
     def drawn(name: str, *columns: str) -> list[Any]:
         data = f"e.model('innovation:{name}-source').data"
@@ -129,9 +129,9 @@ def test_explore_page_shows_report_diagnosis_before_any_change(
         at = 100.0 * axis_fraction(verdict.ratio)
         assert float(place.rstrip("%")) == pytest.approx(at, abs=0.01)
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
-    put(page, sigmaA=0.3)
+    put(page, sigma_a_m_s2=0.3)
     assert page.ask(ROWS) != rows
-    put(page, sigmaA=explored[1].settings.sigma_a_m_s2)
+    put(page, sigma_a_m_s2=explored[1].settings.sigma_a_m_s2)
     assert page.ask(ROWS).keys() == rows.keys()
     assert [row[:2] for row in page.ask(ROWS).values()] == [row[:2] for row in rows.values()]
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
@@ -141,7 +141,7 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
-    put(page, sigmaA=0.002, sigmaZ=0.05, offset=0.1)
+    put(page, sigma_a_m_s2=0.002, sigma_z_m=0.05, clock_offset_s=0.1)
     request = ComparisonRequest(
         log="aisle_uwb.ulg", sigma_a_m_s2=0.002, sigma_z_m=0.05, clock_offset_s=0.1,
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,

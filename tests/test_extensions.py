@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY as ROOT
 
+from px4fuse.batch.changes import SETTING_LABELS
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import ChosenSettings
@@ -160,9 +161,10 @@ def test_extension_guide_names_only_existing_files() -> None:
         "tests/test_findings.py": ["FAULTS"],
         "tests/test_options.py": ["CHANGED"],
         "findings/model.py": ["class CatalogueEntry"],
+        "cli/options.py": ["def request_option"],
         "filter/settings.py": ["class Settings", "SETTING_RANGES"],
         "results/contract.py": ["class ChosenSettings"],
-        "flight/position_source.py": ["ORIGINS"],
+        "flight/model.py": ["ORIGINS"],
         "report/pdf.py": ["PAGES"],
         "cli/__init__.py": ["COMMANDS"],
     }.items():
@@ -175,6 +177,7 @@ def test_each_kf_setting_has_option_range_and_result_field() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)
+    assert {f"settings.{name}" for name in names} <= set(SETTING_LABELS.values())
     assert set(SETTING_RANGES) == {
         name for name in names if isinstance(getattr(Settings(), name), float)
     }

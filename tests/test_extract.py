@@ -18,8 +18,7 @@ from ulog_tools import make_log
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration
-from px4fuse.flight.log import ClockMap, Dropout, InputFile
-from px4fuse.flight.model import Flight, Reset
+from px4fuse.flight.model import ClockMap, Dropout, Flight, InputFile, Reset
 from px4fuse.info import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog

@@ -68,15 +68,18 @@ from px4fuse.findings.model import (
     spans_with_value,
     zero_length_spans,
 )
-from px4fuse.flight.log import ClockMap, Dropout
-from px4fuse.flight.model import Columns, Reset, Unavailable
-from px4fuse.flight.position_source import (
+from px4fuse.flight.model import (
     ALIGNED,
     FROM_INNOVATIONS,
     GNSS,
     LOGGED_BY_EKF2,
     MOTION_CAPTURE,
     RECEIVED,
+    ClockMap,
+    Columns,
+    Dropout,
+    Reset,
+    Unavailable,
 )
 
 

@@ -23,9 +23,18 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
-from px4fuse.flight.log import ClockMap, Dropout
-from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Ekf2, Flight, Reset, Unavailable
-from px4fuse.flight.position_source import ALIGNED
+from px4fuse.flight.model import (
+    ALIGNED,
+    AXIS_NAMES,
+    AidLog,
+    ClockMap,
+    Columns,
+    Dropout,
+    Ekf2,
+    Flight,
+    Reset,
+    Unavailable,
+)
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest, PositionFile
 

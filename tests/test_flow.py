@@ -9,10 +9,11 @@ from ekf2_tools import opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.flow import add_flow_samples, fuse_flow
+from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.inputs import read_gnss
-from px4fuse.ekf2.magnetometer import EventSamples, mean_by_event
+from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean, mean_by_event
 from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.replay_segments import VELOCITY
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
@@ -111,7 +112,7 @@ def test_optical_flow_mean_equals_velocity_at_time_of_update(every):
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end_step
-    found = mean_by_event(with_flow.flow, end, segment.imu_velocity_m_s)
+    found = mean_by_event(segment, with_flow.flow, end)
     has_sample = found.sample_count > 0.0
     assert found.sample_count.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(segment.time_s[end[has_sample]])
@@ -126,17 +127,18 @@ def test_fused_optical_flow_mean_is_weighted_by_sample_count():
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
     samples = EventSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
-    after, left = fuse_flow(x, P, samples, 3.0)
+    gate = np.array([3.0])
+    after, left, _ = fuse_mean(x, P, samples, gate, VELOCITY)
     # 1/P = 1/P₀ + n/R
     assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
     assert after[0, 3:5] == pytest.approx(np.array([1.0, -0.5]) * left[0, 3, 3] * 10.0 / 0.8)
     far = samples._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
-    np.testing.assert_array_equal(fuse_flow(x, P, far, 3.0)[0], x)
-    assert fuse_flow(x, P, far, 3.1)[0][0, 3] > 1.0
+    np.testing.assert_array_equal(fuse_mean(x, P, far, gate, VELOCITY)[0], x)
+    assert fuse_mean(x, P, far, np.array([3.1]), VELOCITY)[0][0, 3] > 1.0
     none = samples._replace(
         sample_count=np.zeros(1), noise=np.zeros(1), rotation_to_body=np.zeros((1, 2, 3))
     )
-    np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
+    np.testing.assert_array_equal(fuse_mean(x, P, none, gate, VELOCITY)[0], x)
 
 
 def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():

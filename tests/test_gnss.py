@@ -28,8 +28,7 @@ from px4fuse.ekf2.replay import inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
-from px4fuse.flight.model import Columns, Flight, FusionRecord, PositionTrack, Unavailable
-from px4fuse.flight.position_source import GNSS
+from px4fuse.flight.model import GNSS, Columns, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import reconstruct_fixes
 from px4fuse.report.clock import clock_advice
@@ -172,7 +171,7 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     assert track.name == "vehicle_gps_position"
     assert reason == "the only position source in the log, fused by EKF2"
     prepared = prepare(flight)
-    assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
+    assert [line.name for line in prepared.input_axes] == ["aisle", "north", "east"]
     # external vision is not reported as missing
     assert not [part for part in prepared.missing if "vision" in f"{part.reason} {part.remedy}"]
     never = flight_of(outdoors(fused=False), tmp_path)
@@ -234,7 +233,7 @@ def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
     prepared = prepare_comparison(request, flight=flight)
-    down, north = prepared.lines
+    down, north = prepared.input_axes
     at = down.measurement_time_s
     np.testing.assert_allclose(at % 0.2, 0.1, atol=1e-6)  # barometer times, not fix times
     np.testing.assert_allclose(down.measurement_m, position(at)[:, 2], atol=1e-4)
@@ -244,7 +243,7 @@ def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     innovations = prepared.flight.ekf2.innovations["down"]  # type: ignore[union-attr]
     np.testing.assert_allclose(innovations["innovation_m"], -0.2, rtol=1e-6)
     fused_as_gnss = prepare_comparison(replace(request, height="gnss"), flight=flight)
-    assert not np.isin(fused_as_gnss.lines[0].measurement_time_s, at).any()
+    assert not np.isin(fused_as_gnss.input_axes[0].measurement_time_s, at).any()
     assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 

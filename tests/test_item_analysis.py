@@ -13,7 +13,7 @@ from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTr
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import Item
 from px4fuse.classroom.grading.oral_check import ask_about_form, questions_text
-from px4fuse.results.answer_form import Answers, Prediction, StudentMistake
+from px4fuse.results.answer_form import Answers, Choice, StudentMistake
 
 POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
 REPORTS = [graded_report(f"{n}.pdf", *row) for n, row in enumerate(POINTS.tolist())]
@@ -25,13 +25,13 @@ TRUTH = FormTruth(
     ("normal",),
     (),
     (1.0, 2.0, 3.0),
-    ((Prediction("mean NIS of KF if the flight had no faults", (1.0, 2.0, 3.0, 4.0)), "c"),),
+    ((Choice("Figure 1: injected fault", ("yaw", "gap", "delay", "gate", "jump")), "c"),),
 )
 FORM = Answers(
     log_sha256="a" * 64,
     mistakes=(StudentMistake("nlos"), StudentMistake("dropout")),
     verdict_kf="consistent",
-    predictions=("a",),
+    choices=("a",),
 )
 
 
@@ -70,9 +70,9 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     assert "You named nlos" in questions[1][0]
     assert "accepted size 8.5 to 11.5 %" in questions[1][1]
     assert "Your flight also has this fault" in questions[2][0]
-    assert "you gave range a" in questions[3][0]
-    assert "Range c is right" in questions[3][1]
-    assert "overconfident (σ is wrong by a factor of 2)" in questions[4][1]
+    assert "your answer is: yaw" in questions[3][0]
+    assert "Right: delay" in questions[3][1]
+    assert len(questions) == 4
 
 
 def test_oral_exam_page_lists_n_questions_per_student() -> None:

@@ -20,9 +20,9 @@ from px4fuse.loop.corrections import (
     HEADINGS_CORRECTED_LABEL,
     POSITIONS_CORRECTED_LABEL,
     SINGLE_LOOP_REASON,
+    odometry_variances,
 )
 from px4fuse.loop.model import Loop, OdometryNoise
-from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
 from px4fuse.request import GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation

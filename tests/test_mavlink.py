@@ -47,10 +47,9 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
-from px4fuse.flight.position_source import MOTION_CAPTURE, RECEIVED
+from px4fuse.flight.model import MOTION_CAPTURE, RECEIVED, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.info.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
@@ -433,7 +432,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     if flight.positions:
         texts += [
             f"{f.message} {f.remedy}"
-            for f in explain(compare(flight)).findings
+            for f in find_faults(compare(flight)).findings
             if f.id != "not_px4"
         ]
     else:
@@ -526,7 +525,7 @@ def test_mavlink_barometer_height_is_computed_from_pressure(read):
     assert altitude_m == pytest.approx([0.0, 400.0, 1000.0], abs=0.1)
     flight = read(add(outdoors(), 5.0, pressure))
     assert compare(flight, axes=("down",)).source.barometer is None
-    (down,) = compare(flight, axes=("down",), height="barometer").lines
+    (down,) = compare(flight, axes=("down",), height="barometer").input_axes
     true = np.array([Aisle().path(BOOT_S + t)[0][2] for t in down.measurement_time_s])
     assert down.measurement_m - true == pytest.approx(0.0, abs=0.05)
     # without a valid time they are dropped with a note

@@ -28,7 +28,7 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED_ANSWERS, NOTICE, PROMPTS, Server
 from px4fuse.results.contract import schema, to_json
 

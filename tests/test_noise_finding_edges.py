@@ -37,7 +37,7 @@ from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noise
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.position_source import GNSS, RECEIVED
+from px4fuse.flight.model import GNSS, RECEIVED
 from px4fuse.loop.model import Closure, Loop, TrueEnd
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))

@@ -12,8 +12,7 @@ from exchange import replace
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight.model import Flight
-from px4fuse.flight.position_source import ORIGINS, find_origin
+from px4fuse.flight.model import ORIGINS, Flight, find_origin
 from px4fuse.request import ComparisonRequest, PositionFile
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import make_scenario

@@ -28,7 +28,7 @@ from px4fuse.comparison.trials import (
     find_trials,
     is_sufficient,
 )
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -50,7 +50,7 @@ OUTDOOR = make_scenario("outdoor", seed=5)
 @cache
 def flown(*texts: str) -> Analysis:
     flight = simulate_flight(OUTDOOR, parse_mistakes(texts))
-    return explain(compare(flight, Settings(0.27, 0.4)))
+    return find_faults(compare(flight, Settings(0.27, 0.4)))
 
 
 def roots(analysis: Analysis) -> list[str]:

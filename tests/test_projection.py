@@ -10,8 +10,7 @@ from flights import Estimator, Uwb, aisle_flight, given_placement, table
 
 from px4fuse.comparison.projection import observation_variance, project_innovations
 from px4fuse.filter.signals import Axis, Segment, make_axes
-from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.flight.position_source import MOTION_CAPTURE
+from px4fuse.flight.model import MOTION_CAPTURE, Columns, Flight, Unavailable
 
 WHOLE = Segment(0.0, 40.0, "")
 HEADING_DEG = 30.0

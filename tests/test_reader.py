@@ -29,14 +29,16 @@ from ulog_tools import (
 
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
-from px4fuse.flight.model import Columns, Reset, Unavailable
-from px4fuse.flight.position_source import (
+from px4fuse.flight.model import (
     ALIGNED,
     FROM_INNOVATIONS,
     GNSS,
     LOGGED_BY_EKF2,
     MOTION_CAPTURE,
     RECEIVED,
+    Columns,
+    Reset,
+    Unavailable,
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S

@@ -7,8 +7,7 @@ from flights import Imu, aisle_flight
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.flight.log import Stream
-from px4fuse.flight.model import Unavailable
+from px4fuse.flight.model import Stream, Unavailable
 
 
 @pytest.mark.parametrize(("topic", "imu_hz", "needed"), [

@@ -83,7 +83,7 @@ REFUSED = {
         "--clock-offset SECONDS",
     ),
     # slips, and what to type instead
-    "slip of a command": ("comapre x.ulg", "Did you mean 'compare'?"),
+    "slip of a command": ("comapre x.ulg", "Did you mean compare?"),
     "no command": ("l.ulg --dt 0.2", "px4fuse compare l.ulg --dt 0.2"),
     "slip of an option": ("compare l.ulg --sigmaz 1", "--sigma-z"),
     "metres with a unit": (
@@ -144,6 +144,7 @@ REFUSED = {
             ("--set EKF2_BARO_DELAY=1", ", ".join(PARAMETERS)),
             ("--set EKF2_EVP_NOISE", "is not NAME=VALUE"),
             ("--set EKF2_EVP_NOISE=much", "'much' is not a number"),
+            ("--set EKF2_EVP_GATE=4SD", "'4SD' is not a number in SD. Give 4"),
             ("--set EKF2_EVP_NOISE=nan", "outside PX4's range"),
             ("--set EKF2_EVP_GATE=3 --set EKF2_EVP_GATE=4", "given twice"),
             ("--sweep EKF2_EVP_NOISE=0.1", "Use NAME=LOW:HIGH"),

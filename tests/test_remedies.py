@@ -13,7 +13,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
 from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
@@ -30,7 +30,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
-    return explain(
+    return find_faults(
         compare(simulate_flight(scenario, parse_mistakes(mistakes)), settings, axes=AXES)
     )
 

@@ -24,17 +24,17 @@ from px4fuse.filter.signals import (
     project_acceleration,
     step_means,
 )
-from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import (
     AXIS_NAMES,
+    RECEIVED,
     Columns,
     Ekf2,
     Flight,
+    LogInfo,
     PositionTrack,
     Reset,
     Unavailable,
 )
-from px4fuse.flight.position_source import RECEIVED
 
 GRAVITY = 9.80665
 NORTH = np.array([1.0, 0.0, 0.0])

@@ -8,7 +8,7 @@ from exchange import replace
 from flights import unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.diagnose import explain
+from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.replay import Agreement
@@ -210,7 +210,9 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     # EKF2 holds its position after 5 s, while the vehicle flies 12 m back and forth
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
     (finding,) = (
-        item for item in explain(compare(flight, RIGHT)).findings if item.id == "ekf2_not_fusing"
+        item
+        for item in find_faults(compare(flight, RIGHT)).findings
+        if item.id == "ekf2_not_fusing"
     )
     assert "EKF2_EV_CTRL" in finding.message
 

@@ -27,8 +27,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
-from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
-from px4fuse.flight.model import Columns, Flight
+from px4fuse.flight.model import REPEATED_TIMESTAMPS, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file

@@ -10,8 +10,7 @@ import pytest
 from flights import Uwb, aisle_flight
 
 from px4fuse.findings.model import SOURCE_WORDS, source_words
-from px4fuse.flight.model import Columns, PositionTrack, kind_without_orientation
-from px4fuse.flight.position_source import PositionKind
+from px4fuse.flight.model import Columns, PositionKind, PositionTrack, kind_without_orientation
 
 # Words that belong to some kinds of source only
 WORDS_OF_KINDS: dict[str, set[PositionKind]] = {

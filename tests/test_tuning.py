@@ -179,7 +179,7 @@ def test_tune_combines_axes_with_equal_timestamps() -> None:
 
 
 def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
-    axes, given = compare(flight, SETTINGS).lines, flight if imu else None
+    axes, given = compare(flight, SETTINGS).input_axes, flight if imu else None
     found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, may_drift=drifts)[HORIZONTAL]
     assert found.biases_fitted == imu
     return found

@@ -17,7 +17,7 @@ from comparisons import compare
 from ekf2_tools import opened, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.diagnose import explain, run_what_if
+from px4fuse.diagnose import find_faults, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
@@ -29,8 +29,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight.model import AidLog, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, AidLog, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.report.difference_page import format_agreement
 from px4fuse.report.whatif import statistic_rows
 from px4fuse.request import WhatIfRequest
@@ -560,7 +559,7 @@ def test_kf_ekf2_difference_on_gnss_flight_includes_vision() -> None:
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
         assert min(moved_m[steps.VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
-    analysis = explain(compare(flown(), Settings(0.27, 0.4)))
+    analysis = find_faults(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"
     assert {trial.filter for trial in analysis.trials} == {"kf"}

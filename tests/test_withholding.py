@@ -17,9 +17,9 @@ from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
-from px4fuse.results.answer_form import PREDICTION_RANGES, form_text
+from px4fuse.results.answer_form import CHOICE_NAMES, form_text
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
@@ -112,26 +112,15 @@ def test_report_on_log_with_removed_assignment_key_is_rejected(
     assert "other log" in result.stdout
 
 
-def test_answer_form_prediction_questions_have_sorted_ranges() -> None:
-    _, answer = simulate_assigned_flight(SECRET, Person("s1"), "aisle", 1)
-    assert answer.form is not None
-    predictions = answer.form.predictions
-    assert len(predictions) >= 6
-    for question, letter in predictions:
-        assert sorted(question.limits) == list(question.limits)
-        assert f"{letter}: " in question.text
-    assert len({letter for _, letter in predictions}) > 1
-
-
-def test_answer_form_without_predictions_earns_part_of_points() -> None:
+def test_answer_form_without_figures_earns_part_of_points() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)
     assert form_points(complete, answer.form).fraction == pytest.approx(1.0)
-    copied = replace(complete, predictions=())
+    copied = replace(complete, choices=())
     assert form_points(copied, answer.form).fraction == pytest.approx(DIAGNOSIS_SHARE)
-    for letter in PREDICTION_RANGES:
-        guessed = replace(complete, predictions=(letter,) * len(complete.predictions))
+    for letter in CHOICE_NAMES:
+        guessed = replace(complete, choices=(letter,) * len(answer.form.choices))
         assert form_points(guessed, answer.form).fraction < 0.6
 
 

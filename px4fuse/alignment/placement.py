@@ -17,23 +17,70 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
-from px4fuse.alignment.file_convention import explain_mismatch
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
+from px4fuse.convention.axes import UNITS
+from px4fuse.convention.check import check_convention
+from px4fuse.convention.correction import MIN_ROTATION_DEG
+from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap, InputFile
-from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Alignment,
+    Columns,
+    Flight,
+    InputFile,
+    PositionTrack,
+    Unavailable,
+    clock_of_repeated_timestamps,
+    time_index,
+)
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
+
+# Maximum time span (s) of file and log for _explain_mismatch, which takes 1 s per hour
+MAX_EXPLAINED_SPAN_S = 7200.0
+
+
+def _explain_mismatch(
+    flight: Flight, problem: AlignmentProblem, metres_per_unit: float
+) -> tuple[str, str] | None:
+    """Return fault and action if the IMU data show wrong axes or a wrong unit of the file."""
+    samples = problem.samples
+    span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
+    if span_s > MAX_EXPLAINED_SPAN_S:
+        return None
+    time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
+    positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
+    table = pd.DataFrame(positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION)
+    track = PositionTrack("", POSITION_FILE, "", table, "unknown", "", ())
+    search_limits = {} if problem.lag_s is not None else {"max_offset_s": span_s}
+    convention = check_convention(flight, track, **search_limits)
+    if convention is None or convention.verdict != "determined":
+        return None
+    axes, faults = convention.axes, []
+    if UNITS[convention.unit] != metres_per_unit:
+        stated_unit = next(
+            name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit
+        )
+        faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
+    stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
+    is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
+    if stated_frame and axes != FRAME_AXES[stated_frame] and not is_rotated:
+        faults.append(
+            describe_axes(axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=True)
+        )
+    if not faults:
+        return None
+    fault_texts, actions = zip(*faults, strict=True)
+    return "; ".join(fault_texts), " ".join(actions)
+
 
 # Maximum ratio of the second best to the best residual for a warning about an ambiguous time
 # offset, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
-# Maximum fraction of rows with distinct timestamps in a file whose timestamps are too coarse
-MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
@@ -80,14 +127,13 @@ def align_position_file(
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
-    boot_s = flight.log.boot_time_s
+    boot_s, duration_s = flight.log.boot_time_s, flight.log.duration_s
     spans_text = (
-        f"the log is from {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot "
-        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} "
-        "clock"
+        f"the log is from {boot_s:.2f} s to {boot_s + duration_s:.2f} s on the boot clock, the "
+        f"position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
-    if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
+    if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
             f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
@@ -99,25 +145,28 @@ def align_position_file(
     try:
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
-        if fault := explain_mismatch(flight, problem, recording.metres_per_unit):
+        if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
             raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
-    yaw_reason = "the yaw was given with --position-yaw"
-    if yaw_deg is None:
-        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
     frame_reason = "the column names of the position file show the frame"
     if recording.format:
         frame_reason = f"files of the format {recording.format} have this frame"
     if frame:
         frame_reason = "the frame was given with --position-frame"
+    yaw_reason = "the yaw was given with --position-yaw"
+    if yaw_deg is None:
+        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
     alignment, aligned_samples = _describe_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    clock_map = _clock_with_shared_timestamps(recording)
+    invalid, sample_count = recording.invalid, len(recording.samples)
+    clock_map = clock_of_repeated_timestamps(
+        recording.clock, sample_count + recording.dropped, sample_count
+    )
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -131,31 +180,17 @@ def align_position_file(
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid=recording.invalid.set_axis(
-            recording.invalid.index + (aligned_samples.index[0] - start_s)
-        ),
+        invalid=invalid.set_axis(invalid.index + (aligned_samples.index[0] - start_s)),
         step_m=recording.step_m,
     )
     notes = [f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)]
-    dropped = dict(flight.log.dropped)
-    if recording.dropped and not clock_map:
-        dropped[recording.name] = recording.dropped
+    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+    log = flight.log
     return replace(
         flight,
-        log=structs.replace(flight.log, notes=(*flight.log.notes, *notes), dropped=dropped),
+        log=structs.replace(log, notes=(*log.notes, *notes), dropped={**log.dropped, **dropped}),
         positions=(track, *flight.positions),
         inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
-    )
-
-
-def _clock_with_shared_timestamps(recording: PositionRecording) -> ClockMap | None:
-    """Return the clock of a file in which most rows repeat a timestamp, else None."""
-    distinct_count = len(recording.samples)
-    row_count = distinct_count + recording.dropped
-    if distinct_count > MAX_DISTINCT_FRACTION * row_count:
-        return None
-    return ClockMap(
-        recording.clock, "as sent", row_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
     )
 
 
@@ -163,10 +198,8 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame not in (None, *tracks.FRAMES):
-        raise SettingsError(
-            f"`frame` {frame} is not a known coordinate frame.",
-            f"Use one of {', '.join(tracks.FRAMES)}.",
-        )
+        remedy = f"Use one of {', '.join(tracks.FRAMES)}."
+        raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
@@ -223,8 +256,9 @@ def _describe_alignment(
         reference = EKF2_POSITION
         distance_m, correlation = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_m**2) / 2.0))
-    frame_conflict = "" if is_yaw_free else _describe_frame_conflict(match, distance_m, yaw_rad)
-    warnings = [*_find_warnings(match, is_yaw_free)]
+    frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_free)] if match else []
+    if match and not is_yaw_free:
+        frame_conflict = _describe_frame_conflict(match, distance_m, yaw_rad)
     if (
         ekf2_comparison
         and not (is_yaw_free or frame_conflict)
@@ -269,27 +303,24 @@ def _compare_with_ekf2(
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2_position_m, is_known = tracks.ekf2_track_without_resets(
-            flight.ekf2, aligned_samples
-        ).at(aligned_samples.index.to_numpy())
+        ekf2_track = tracks.ekf2_track_without_resets(flight.ekf2, aligned_samples)
     except NoMatchError:
         return None
+    ekf2_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
     if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
     file_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
-    ekf2_m = ekf2_position_m[is_known, :2]
+    ekf2_m = ekf2_m[is_known, :2]
     distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
     file_m -= file_m.mean(axis=0)
     ekf2_m -= ekf2_m.mean(axis=0)
-    norm_product = float(np.linalg.norm(file_m) * np.linalg.norm(ekf2_m))
+    norm_product = np.linalg.norm(file_m) * np.linalg.norm(ekf2_m)
     if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m)) / norm_product
+    return distance_m, float(np.sum(file_m * ekf2_m) / norm_product)
 
 
-def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
-    if match is None:
-        return ""
+def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
     fit = match.free_yaw_fit
     is_rotated = match.is_rotated
@@ -313,9 +344,7 @@ def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_
     )
 
 
-def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:
-    if match is None:
-        return
+def _find_warnings(match: Match, is_yaw_free: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance < matching.MIN_GOOD_CONCORDANCE[reference_name]:

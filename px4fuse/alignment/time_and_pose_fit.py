@@ -87,7 +87,9 @@ def find_correlation_peak(
     NoMatchError
         No lag has sufficient overlap.
     """
-    if not file_track.is_valid.any() or not reference.is_valid.any():
+    shorter_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
+    min_count = max(tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_count / 2))
+    if shorter_count < min_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = moments(
         file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
@@ -95,10 +97,7 @@ def find_correlation_peak(
     common_count = track_moments.count
     covariance = track_moments.covariance
     power_sum = track_moments.power_a + track_moments.power_b
-    shorter_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
-    has_overlap = common_count >= max(
-        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_count / 2.0)
-    )
+    has_overlap = common_count >= min_count
     if not has_overlap.any():
         raise NoMatchError("position file and reference have too few common samples for a match")
     has_overlap &= power_sum > 1e-9 * np.max(power_sum)  # at rest, the variance is a rounding error

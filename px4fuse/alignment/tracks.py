@@ -11,8 +11,15 @@ from scipy.signal import butter, sosfiltfilt
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.core.arrays import Array, BoolArray, Complex
 from px4fuse.filter.signals import Segment, ned_acceleration
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, Unavailable, time_index
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Unavailable,
+    time_index,
+)
 from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.time_offset import GRID_STEP_S

@@ -17,6 +17,7 @@ from px4fuse.batch.rows import value_at
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number
+from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
@@ -25,11 +26,12 @@ from px4fuse.results.model import provenance, schema_of
 MAX_NEES_SIGMA_RATIO = 2.0
 # Path in the results of each setting or flight property that px4fuse diff compares, by its label
 SETTING_LABELS = {
-    "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
-    "SIGMA_Z (m)": "settings.sigma_z_m",
-    "DT (s)": "settings.dt_s",
-    "input": "settings.input",
-    "time offset added to the source (s)": "settings.clock_offset_s",
+    **{
+        f"{SETTING_RANGES[name].label} ({SETTING_RANGES[name].unit})"
+        if name in SETTING_RANGES
+        else name: f"settings.{name}"
+        for name in Settings.__dataclass_fields__
+    },
     "start of the analysed time (s)": "settings.start_s",
     "end of the analysed time (s)": "settings.end_s",
     "position source": "source.name",

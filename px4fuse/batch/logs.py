@@ -53,30 +53,22 @@ def _logs_in(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _file_system(pattern)
+    suffixes: tuple[str, ...] = ("",)
     try:
         if file_system.isdir(root_path):
-            all_files = file_system.find(root_path, detail=True)
-            info_by_path = {
-                path: file_info
-                for path, file_info in all_files.items()
-                if path.lower().endswith(LOG_SUFFIXES)
-            }
+            suffixes = LOG_SUFFIXES
+            info_by_path = file_system.find(root_path, detail=True)
         # devices and pipes are included: the worker process that opens them reports an error
         elif file_system.exists(root_path):
-            info_by_path = {
-                root_path: file_system.info(root_path) if file_system.isfile(root_path) else {}
-            }
+            is_file = file_system.isfile(root_path)
+            info_by_path = {root_path: file_system.info(root_path) if is_file else {}}
         else:
-            all_files = (
-                file_system.glob(root_path, detail=True)
-                if any(wildcard in pattern for wildcard in "*?[")
-                else {}
-            )
-            info_by_path = {
-                path: file_info
-                for path, file_info in all_files.items()
-                if file_info["type"] == "file"
-            }
+            info_by_path = file_system.glob(root_path, detail=True)
+        info_by_path = {
+            path: file_info
+            for path, file_info in info_by_path.items()
+            if path.lower().endswith(suffixes) and file_info.get("type", "file") == "file"
+        }
     # fsspec raises other exceptions than OSError for URLs, such as an unknown account
     except Exception as error:
         raise SettingsError(

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
 from px4fuse.card.model import RATIO_AXIS_ENDS
-from px4fuse.core.text import format_metres, format_number, format_ratio, join_first
+from px4fuse.core.text import count_noun, format_metres, format_number, format_ratio, join_first
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
@@ -22,7 +22,7 @@ from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
 # verdicts of the diagnosis (Card)
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
-SEVERITIES = ("error", "warning", "note", "clean", "refused")
+SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns with one value per axis, which the page shows after a click on a row
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
@@ -85,7 +85,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     ]
     return frame.page(
         title=title,
-        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}. Compared by {made_with}.",
+        subtitle=f"{count_noun(len(logs), 'log')}. Compared by {made_with}.",
         html_above=load_template("batch/axis.html").render(limits=band_limits()),
         row_nouns=("log", "logs"),
         columns=(
@@ -94,9 +94,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{filter_name.upper()} {MARKS[reference_name]}",
-                    "ratio",
-                    visible_from="tablet",
+                    f"{filter_name.upper()} {MARKS[reference_name]}", "ratio", visible_from="tablet"
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
@@ -130,12 +128,12 @@ def _log_cells(log: Log) -> tuple[Cell, ...]:
             _ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
-        _value_cell(log.get("difference_rms_m"), format_metres),
+        frame.number_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
         frame.text_cell(log.get("vehicle", "")),
         frame.text_cell(log.get("firmware", "")),
-        _value_cell(log.get("sigma_z_m"), format_number),
-        _value_cell(log.get("clock_offset_s"), format_number),
+        frame.number_cell(log.get("sigma_z_m"), format_number),
+        frame.number_cell(log.get("clock_offset_s"), format_number),
         Cell()
         if log["status"] == FAILED
         else frame.number_cell(
@@ -165,10 +163,6 @@ def sort_logs(logs: Iterable[Log]) -> list[Log]:
         )
 
     return sorted(logs, key=sort_key)
-
-
-def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Cell:
-    return Cell() if value is None else frame.number_cell(value, format_value(value))
 
 
 def _log_details(log: Log) -> tuple[Section, ...]:

@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.card.model import Card
 from px4fuse.core.record import Unavailable
 from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import utc_time
+from px4fuse.core.text import replace_unencodable, utc_time
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
 from px4fuse.request import quote_command
@@ -156,7 +156,7 @@ def make_table(rows: Iterable[Row]) -> pd.DataFrame:
 def clean_row(row: Row) -> Row:
     """Remove missing values from a row, and replace bytes of file names that are not UTF-8."""
     return {
-        name: value.encode(errors="replace").decode() if isinstance(value, str) else value
+        name: replace_unencodable(value) if isinstance(value, str) else value
         for name, value in row.items()
         if value is not None
     }

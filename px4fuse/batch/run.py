@@ -1,6 +1,5 @@
 """Run of ``px4fuse batch``: compares logs in worker processes, and writes the table."""
 
-import io
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -144,11 +143,9 @@ def run_batch(
         batch_result = run(
             map(str, sources), folder, reports=reports and output is not None, **settings
         )
-    return (
-        batch_result.table
-        if output is not None
-        else batch_result.table.assign(results="", report="")
-    )
+    # without an output folder, the files are deleted already
+    missing_files = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
+    return batch_result.table.assign(**missing_files)
 
 
 def run(
@@ -220,35 +217,30 @@ def run(
                 if state.hash_by_address or state.failed_rows:
                     batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            has_cached_rows = (output / "rows").is_dir()
-            raise type(error)(
-                f"{error} {RESUME_NOTE if has_cached_rows else ''}".rstrip()
-            ) from error
+            note = RESUME_NOTE if (output / "rows").is_dir() else ""
+            raise type(error)(f"{error} {note}".rstrip()) from error
     return batch_result
 
 
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
     """Return the SHA-256 of finished logs by size, as only logs of equal size may be identical."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
-    for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
+    for cached_rows in load_cached_rows(state):
         first_row = cached_rows.rows[0]
-        output_files = [
-            state.output / first_row.get(column, "")
-            for column in OUTPUT_FILE_COLUMNS[: 1 + reports]
-        ]
-        if "axis" not in first_row or all(output_file.is_file() for output_file in output_files):
+        columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
+        if all((state.output / first_row.get(column, "")).is_file() for column in columns):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
 
-def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
-    """Yield the cached table rows in a folder for this px4fuse version and these settings."""
-    for cache_file in sorted((folder / "rows").glob("*.json")):
+def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
+    """Yield the cached table rows in the output folder for the version and settings of a run."""
+    for cache_file in sorted((state.output / "rows").glob("*.json")):
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
-        if (cached_rows.px4fuse, cached_rows.settings) == (px4fuse, settings):
+        if (cached_rows.px4fuse, cached_rows.settings) == (state.px4fuse, state.settings):
             yield cached_rows
 
 
@@ -285,10 +277,7 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
 def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
     severities: set[str] = set()
-    rows_by_hash = {
-        cached_rows.sha256: cached_rows.rows
-        for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings)
-    }
+    rows_by_hash = {cached_rows.sha256: cached_rows.rows for cached_rows in load_cached_rows(state)}
 
     def rows_of_log(log: LogAddress) -> Iterable[Row]:
         if log.address not in state.hash_by_address:
@@ -313,10 +302,8 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
-    parquet = io.BytesIO()
-    table.to_parquet(parquet, index=False)
     contents = {
-        state.output / "fleet.parquet": parquet.getvalue(),
+        state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": csv_bytes(table),
         state.output / "fleet.html": page.encode(),
     }

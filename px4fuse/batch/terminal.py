@@ -73,18 +73,14 @@ def format_differences(results: ChangeResults) -> Page:
     """Format the output of ``px4fuse diff``: differences, and verdicts that are worse in B."""
     page = Page()
     for name, diff_input in (("A", results.a), ("B", results.b)):
-        log = (
-            diff_input.kind
-            if diff_input.given == diff_input.log
-            else f"{diff_input.kind} of {diff_input.log}"
-        )
+        log = f" of {diff_input.log}" * (diff_input.given != diff_input.log)
         versions = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
-        page.write_labelled(name, f"{diff_input.given} ({log}), {versions}")
-    if results.settings:
-        settings = [
-            (setting.name, _format_setting(setting.a), _format_setting(setting.b))
-            for setting in results.settings
-        ]
+        page.write_labelled(name, f"{diff_input.given} ({diff_input.kind}{log}), {versions}")
+    settings = [
+        (setting.name, _format_setting(setting.a), _format_setting(setting.b))
+        for setting in results.settings
+    ]
+    if settings:
         page.table(("setting", "A", "B"), settings)
     rows = []
     for number in results.numbers:

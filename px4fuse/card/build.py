@@ -7,8 +7,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
@@ -37,30 +35,32 @@ from px4fuse.card.model import (
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
-from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
-from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log_name
+from px4fuse.core.text import (
+    capitalise_first,
+    format_metres,
+    format_ratio,
+    lower_first,
+    with_log_name,
+)
 from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
-from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, group_by_root
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.log import LogInfo
-from px4fuse.flight.model import Ekf2, Unavailable, source_name
+from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-KF_SETTINGS = {"sigma_a_m_s2": "SIGMA_A", "sigma_z_m": "SIGMA_Z", "dt_s": "DT"}
 # Minimum fraction of positions rejected by EKF2 that the diagnosis card states
 MIN_NAMED_REJECTED_FRACTION = 0.01
-POSITION_IMPROVEMENTS = ("position and σ", "position")
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
@@ -76,8 +76,6 @@ HEADING_HIDES_ERROR = (
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
 )
-WITHHELD_HEADLINE = "Assignment: the student makes the diagnosis, so px4fuse prints none"
-NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
 # Explanation of different verdicts against source and ground truth, by ids of findings
 SENTENCES_BY_SOURCE_FAULTS = (
     (
@@ -116,7 +114,8 @@ def build_card(
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
     )
     if analysis.flight.log.is_assessed:
-        return Card(severity="note", headline=WITHHELD_HEADLINE, identity=identity)
+        headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
+        return Card(severity="note", headline=headline, identity=identity)
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     sigma_verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, root_findings)
@@ -124,30 +123,10 @@ def build_card(
         make_cause(analysis, ranked_finding, sigma_verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
     )
-    may_source_drift = source.origin.may_drift
-    sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_source_drift)
-    horizon_ratio = None if causes else _horizon_ratio(analysis)
-    if horizon_ratio is not None:
-        sigma_verdicts = (*sigma_verdicts[:-1], replace(sigma_verdicts[-1], is_explained=True))
-    reconcile = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
-    if (
-        not reconcile
-        and any(verdict.is_explained for verdict in sigma_verdicts)
-        and may_source_drift
-    ):
-        reconcile = DRIFT_HIDES_ERROR
-    if horizon_ratio is not None:
-        reconcile = (
-            "EKF2's published position lags because of its output predictor, and σ does not "
-            "include this lag. At the fusion horizon, EKF2's position error is "
-            f"{format_ratio(horizon_ratio)} times σ: consistent."
-        )
-    elif reconcile == UNEXPLAINED_DIFFERENCE:
-        sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
+    sigma_verdicts, reconcile = _reconcile(analysis, sigma_verdicts, causes)
     effect = _make_effect(analysis)
-    severity: CardSeverity = (
-        "note" if any(verdict.is_fault for verdict in sigma_verdicts) else "clean"
-    )
+    has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
+    severity: CardSeverity = "note" if has_fault else "clean"
     return Card(
         severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
@@ -166,7 +145,7 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
+    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
     """Build the diagnosis card of a flight without a position source, on EKF2's aiding sources."""
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
@@ -228,11 +207,10 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
     if fault_verdicts := [verdict for verdict in sigma_verdicts if verdict.is_fault]:
         worst_verdict = max(fault_verdicts, key=lambda verdict: abs(math.log(verdict.ratio or 1.0)))
         ratio = worst_verdict.ratio or 1.0
-        direction = "small" if ratio > 1.0 else "large"
-        factor_text = format_ratio(max(ratio, 1.0 / ratio))
         return (
-            f"{FILTER_NAMES[worst_verdict.filter]} {worst_verdict.word}: σ {factor_text} times too "
-            f"{direction} against "
+            f"{FILTER_NAMES[worst_verdict.filter]} {worst_verdict.word}: σ "
+            f"{format_ratio(max(ratio, 1.0 / ratio))} times too "
+            f"{'small' if ratio > 1.0 else 'large'} against "
             f"{'the source' if worst_verdict.against == 'source' else 'ground truth'}"
         )
     if all(verdict.word == "not evaluated" for verdict in sigma_verdicts):
@@ -240,21 +218,17 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
     consistent_filters = {
         verdict.filter for verdict in sigma_verdicts if verdict.word == "consistent"
     }
-    return (
-        NO_FAULT_HEADLINE
-        if len(consistent_filters) == 2
-        else f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
-    )
+    if len(consistent_filters) == 2:
+        return "No fault found: KF and EKF2 are consistent"
+    return f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
 
 
 def _make_effect(analysis: Analysis) -> Effect:
     result, difference = analysis.main, analysis.main.difference
-    reset_count, flight_segment = None, analysis.segment.flight
+    reset_count, segment = None, analysis.segment.flight
     if isinstance(analysis.flight.ekf2, Ekf2):
         resets_s = horizontal_resets_s(analysis.flight.ekf2)
-        reset_count = int(
-            ((flight_segment.start_s < resets_s) & (resets_s <= flight_segment.end_s)).sum()
-        )
+        reset_count = int(((segment.start_s < resets_s) & (resets_s <= segment.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, result),
         position_rmse_m=_position_rmse_m(result),
@@ -267,12 +241,10 @@ def _make_effect(analysis: Analysis) -> Effect:
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     """Describe the direction of an axis: "along the main axis, 30° from north"."""
-    direction, heading = f"along {result.axis.label}", result.heading_deg
+    direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
     if result.axis.name != AISLE or heading is None:
         return direction
-    reference = "north"
-    if analysis.source.frame == "FRD":
-        reference = f"the {source_name(analysis.source)} x axis"
+    reference = f"the {source_name(source)} x axis" if source.frame == "FRD" else "north"
     return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 
@@ -286,79 +258,78 @@ def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     errors_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
-    if len(errors_m) < 2:
-        return {}
-    north_m, east_m = errors_m
-    return {name: math.hypot(north_m[name], east_m[name]) for name in north_m if name in east_m}
+    return {
+        name: math.hypot(*(error_m[name] for error_m in errors_m))
+        for name in FILTER_NAMES
+        if len(errors_m) == 2 and all(name in error_m for error_m in errors_m)
+    }
 
 
 def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
-    is_part_of_flight = (
-        max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
-    )
-    span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part_of_flight else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
-        horizontal_text = _lengths_by_filter(effect.horizontal_rmse_m)
-        horizontal_text = f" (horizontal: {horizontal_text})" if horizontal_text else ""
+        span_text = horizontal_text = ""
+        if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
+            span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
+        if effect.horizontal_rmse_m:
+            horizontal_text = f" (horizontal: {_lengths_by_filter(effect.horizontal_rmse_m)})"
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{span_text}: "
             f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal_text}."
         )
-        for verdict in sigma_verdicts:
-            if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
-                sentences.append(
-                    f"The position error of {FILTER_NAMES[verdict.filter]} is "
-                    f"{format_ratio(verdict.ratio)} times its reported σ."
-                )
+        sentences += [
+            f"The position error of {FILTER_NAMES[verdict.filter]} is "
+            f"{format_ratio(verdict.ratio)} times its reported σ."
+            for verdict in sigma_verdicts
+            if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent"
+        ]
         sentences += _worst_axis_sentences(analysis)
     if effect.difference_rms_m is not None and (
         not effect.position_rmse_m
         or all(verdict.word == "consistent" for verdict in sigma_verdicts)
     ):
-        sentences.append(
-            f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS."
-        )
+        sentences.append(f"{_format_difference(effect.difference_rms_m)}.")
     if not effect.position_rmse_m:
         sentences.append(
             "The log has no ground truth, so the position errors of KF and EKF2 are unknown."
         )
-    if (
-        rejected_fraction := effect.rejected_fraction
-    ) is not None and rejected_fraction >= MIN_NAMED_REJECTED_FRACTION:
+    rejected_fraction = effect.rejected_fraction or 0.0
+    if rejected_fraction >= MIN_NAMED_REJECTED_FRACTION:
         sentences.append(f"EKF2 rejected {format_percent(rejected_fraction)} of the positions.")
     if effect.horizontal_resets:
-        reset_count = format_count(effect.horizontal_resets)
-        sentences.append(f"EKF2 reset its horizontal position {reset_count}.")
+        count_text = format_count(effect.horizontal_resets)
+        sentences.append(f"EKF2 reset its horizontal position {count_text}.")
     return " ".join(sentences)
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    errors_by_axis = {
-        result.axis.label: truth
-        for result in analysis.secondary_axes
+    results = (analysis.main, *analysis.secondary_axes)
+    errors_by_axis = [
+        (truth.nees_position_mean, result, truth.position_rmse_m)
+        for result in results
         if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
         and truth.nees_position_mean
-        and not truth.is_lag_only
-    }
+        and not (truth.is_lag_only and result is not analysis.main)
+    ]
     if not errors_by_axis:
         return []
-    axis_label, worst_errors = max(
-        errors_by_axis.items(), key=lambda item: item[1].nees_position_mean or 0.0
-    )
-    ratio = math.sqrt(worst_errors.nees_position_mean or 0.0)
-    main_truth = analysis.main.filters["ekf2"].truth
-    main_nees = 0.0 if isinstance(main_truth, Unavailable) else main_truth.nees_position_mean or 0.0
-    if classify_sigma_ratio(ratio, "truth") != "overconfident" or ratio**2 <= main_nees:
+    nees, worst_result, rmse_m = max(errors_by_axis, key=lambda errors: errors[0])
+    ratio = math.sqrt(nees)
+    is_overconfident = classify_sigma_ratio(ratio, "truth") == "overconfident"
+    if worst_result is analysis.main or not is_overconfident:
         return []
     return [
-        f"EKF2's RMSE along {axis_label} is {format_metres(worst_errors.position_rmse_m)} m, "
+        f"EKF2's RMSE along {worst_result.axis.label} is {format_metres(rmse_m)} m, "
         f"{format_ratio(ratio)} times its reported σ."
     ]
+
+
+def _format_difference(rms_m: float) -> str:
+    return f"Position difference KF − EKF2: {format_metres(rms_m)} m RMS"
 
 
 def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
@@ -369,28 +340,22 @@ def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
+    if not causes:
+        return ("Change nothing.",)
     numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
-        sentences = [
+        alternatives = [
+            _action_sentence(action) for group in cause.alternatives for action in group
+        ]
+        sentences = [", or ".join(alternatives)] if alternatives else []
+        sentences += [
             _action_sentence(action)
             for action in cause.actions
             if action.commands or not action.sentence.startswith("no ")
         ]
-        if cause.alternatives:
-            alternative_sentences = [
-                _action_sentence(action) for group in cause.alternatives for action in group
-            ]
-            sentences.insert(
-                0,
-                ", or ".join(
-                    [*(text[:-1] for text in alternative_sentences[:-1]), alternative_sentences[-1]]
-                ),
-            )
         label = f"({number}) " if len(causes) > 1 else ""
-        numbered_sentences += [f"{label}{sentence}" for sentence in sentences]
-    return (
-        tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS] if causes else ("Change nothing.",)
-    )
+        numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
+    return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
 
 def _action_sentence(action: Action) -> str:
@@ -398,12 +363,12 @@ def _action_sentence(action: Action) -> str:
         # the command already contains the name of the parameter
         value_change = action.sentence.partition(" ")[2]
         change_text = value_change if len(action.commands) == 1 else action.sentence
-        return f"EKF2: {', '.join(action.commands)} ({change_text})."
+        return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
-        return f"KF: {action.sentence or 'run again with'} --{options}."
+        return f"KF: {action.sentence or 'run again with'} --{options}"
     text = lower_first(action.sentence.rstrip("."))
-    return f"{action.target[0].upper()}{action.target[1:]}: {text}."
+    return f"{capitalise_first(action.target)}: {text}"
 
 
 def _mark_explained(
@@ -436,25 +401,32 @@ def _mark_explained(
     )
 
 
-def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return EKF2's RMS error ÷ σ at the fusion horizon if EKF2 is consistent there, else None.
-
-    The published position contains the lag of EKF2's output predictor, which σ does not include.
-    """
-    result, ekf2 = analysis.main, analysis.flight.ekf2
-    published_verdict = make_sigma_verdicts(result)[-1]
-    if published_verdict.word != "overconfident" or not isinstance(ekf2, Ekf2):
-        return None
-    horizon_track = project_horizon(ekf2, result.axis, analysis.segment)
-    if horizon_track is None or not isinstance(result.truth, pd.DataFrame):
-        return None
-    true_m = result.truth["position_m"]
-    error_m = horizon_track["position_m"] - np.interp(
-        horizon_track.index, true_m.index, true_m, np.nan, np.nan
+def _reconcile(
+    analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
+) -> tuple[tuple[Verdict, ...], str]:
+    """Mark explained verdicts, and explain verdicts that differ."""
+    may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
+    sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_drift)
+    *other_verdicts, ekf2_verdict = sigma_verdicts
+    horizon_nees = (
+        not causes
+        and ekf2_verdict.word == "overconfident"
+        and isinstance(ekf2_errors, ErrorsAgainstTruth)
+        and ekf2_errors.nees_position_horizon_mean
     )
-    nees = float(np.nanmean(np.square(error_m) / horizon_track["position_variance_m2"]))
-    ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
-    return ratio if classify_sigma_ratio(ratio, "truth") == "consistent" else None
+    ratio = math.sqrt(horizon_nees or math.inf)
+    if classify_sigma_ratio(ratio, "truth") == "consistent":
+        return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
+            "EKF2's published position lags because of its output predictor, and σ does not "
+            "include this lag. At the fusion horizon, EKF2's position error is "
+            f"{format_ratio(ratio)} times σ: consistent."
+        )
+    explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
+    if explanation == UNEXPLAINED_DIFFERENCE:
+        sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
+    elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
+        explanation = DRIFT_HIDES_ERROR
+    return sigma_verdicts, explanation
 
 
 def _explain_differing_verdicts(
@@ -494,11 +466,9 @@ def _explain_differing_verdicts(
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
-        noise_text = ""
-        if isinstance(horizontal_tuning, AxisTuning) and (
-            noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
-        ):
-            noise_text = f" of {format_metres(noise_m)} m"
+        sigma_z = horizontal_tuning.sigma_z if isinstance(horizontal_tuning, AxisTuning) else None
+        noise_m = sigma_z and (sigma_z.value or sigma_z.high)
+        noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
         return (
             f"The position noise{noise_text} is smaller than KF and EKF2 assume. Only ground truth "
             "shows the drift of the source."
@@ -508,43 +478,34 @@ def _explain_differing_verdicts(
             "Innovations show only position errors that change from sample to sample. KF and "
             "EKF2 follow slow position errors, so only ground truth shows them."
         )
-    unexplained_text = (
-        HEADING_HIDES_ERROR if "ekf2_heading_error" in finding_ids else UNEXPLAINED_DIFFERENCE
-    )
+    has_heading_error = "ekf2_heading_error" in finding_ids
+    explanation = HEADING_HIDES_ERROR if has_heading_error else UNEXPLAINED_DIFFERENCE
     rejects_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
-    return _gate_sentence(analysis) if rejects_outliers else unexplained_text
+    return _gate_sentence(analysis) if rejects_outliers else explanation
 
 
 def _gate_sentence(analysis: Analysis) -> str:
     innovations = analysis.main.ekf2_innovations
     assert not isinstance(innovations, Unavailable)  # without innovations EKF2 has no verdict
-    accepted_innovations = innovations[~(innovations["rejected"] > 0.0)]
-    ratio = math.sqrt(
-        float(
-            (
-                accepted_innovations["innovation_m"] ** 2
-                / accepted_innovations["innovation_variance_m2"]
-            ).mean()
-        )
-    )
-    rejected_count = int((innovations["rejected"] > 0.0).sum())
+    is_rejected = innovations["rejected"] > 0.0
+    accepted = innovations[~is_rejected]
+    nis = float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
     return (
-        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, which its mean "
-        f"NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {int(is_rejected.sum())} of {len(innovations)} positions, which its "
+        "mean NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is "
+        f"{format_ratio(math.sqrt(nis))}."
     )
 
 
 def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
-    difference_text = (
-        f"Position difference KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
-    )
+    difference_text = _format_difference(effect.difference_rms_m)
     trials = ranked_causes[0].trials
     corrected_filters = {
         trial.filter
         for trial in trials
-        if improvement(trial) in POSITION_IMPROVEMENTS or not can_show_effect(trial)
+        if "position" in improvement(trial) or not can_show_effect(trial)
     }
     if len(corrected_filters) == 2:
         return (
@@ -554,15 +515,11 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     difference_after_by_filter = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
     }
-    filter_name: FilterName = (
-        "ekf2"
-        if corrected_filters == {"ekf2"} or set(difference_after_by_filter) == {"ekf2"}
-        else "kf"
-    )
-    difference_after_m = difference_after_by_filter.get(filter_name)
+    is_ekf2 = {"ekf2"} in (corrected_filters, difference_after_by_filter.keys())
+    difference_after_m = difference_after_by_filter.get("ekf2" if is_ekf2 else "kf")
     if difference_after_m is None:
         return f"{difference_text}."
-    suffix = "predicted with EKF2" if filter_name == "ekf2" else "with KF"
+    suffix = "predicted with EKF2" if is_ekf2 else "with KF"
     return f"{difference_text}; {format_metres(difference_after_m)} m {suffix} corrected."
 
 
@@ -593,13 +550,14 @@ def _make_identity(
 def _settings_text(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
     setting_texts = []
-    for name, label in KF_SETTINGS.items():
+    for name in KF_NUMBERS:
         value, value_origin = getattr(settings, name), "set by the user"
+        unit, label = SETTING_RANGES[name][2:]
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             value_origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):
             value_origin = "default"
-        setting_texts.append(f"{label} {value:g} {SETTING_RANGES[name].unit} ({value_origin})")
+        setting_texts.append(f"{label} {value:g} {unit} ({value_origin})")
     return ", ".join(setting_texts)
 
 
@@ -607,15 +565,16 @@ def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
-        for name in KF_SETTINGS
+        for name in KF_NUMBERS
         if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
     )
 
 
 def _changed_parameter_texts(analysis: Analysis) -> tuple[str, ...]:
-    if analysis.source.origin.aid is None:
+    aid = analysis.source.origin.aid
+    if aid is None:
         return ()
-    aid, log = analysis.source.origin.aid, analysis.flight.log
+    log = analysis.flight.log
     return tuple(
         f"{name} {value:.4g} {PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
         for name in (aid.noise, aid.delay, aid.gate)

@@ -183,52 +183,39 @@ def _make_actions(
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return (groups of alternative actions, actions that are always necessary)."""
     finding = ranked_cause.finding
-    trial_by_filter_and_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
-    alternatives: tuple[tuple[Action, ...], ...] = ()
-    actions: list[Action] = []
-    general_action = None
+    trials = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
+    sender_actions: list[Action] = []
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
-        general_action = Action(_target_of(finding, analysis.source), remedy)
-    delay_trial = trial_by_filter_and_kind.get(("ekf2", "delay"))
-    if offset_trial := trial_by_filter_and_kind.get(
-        ("ekf2", "time offset")
-    ) or trial_by_filter_and_kind.get(("kf", "time offset")):
-        shift_s = offset_trial.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
-            offset_trial.filter == "kf"
-        )
+        sender_actions.append(Action(_target_of(finding, analysis.source), remedy))
+    delay_trial = trials.get(("ekf2", "delay"))
+    delay_actions = [make_parameter_action(analysis, delay_trial.change)] if delay_trial else []
+    offset_trial = trials.get(("ekf2", "time offset")) or trials.get(("kf", "time offset"))
+    # users cannot shift the timestamps of a GNSS receiver
+    if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
+        shift_s = offset_trial.change[CLOCK_OFFSET]
+        if offset_trial.filter == "kf":
+            shift_s -= analysis.settings.clock_offset_s
         add_or_subtract = lower_first(format_shift(shift_s))
-        timestamp_action = Action(
-            "sender", f"{add_or_subtract} the timestamp (usec) of each position"
-        )
-        if analysis.source.origin.is_gnss and general_action is not None:
-            timestamp_action = (
-                general_action  # users cannot shift the timestamps of a GNSS receiver
-            )
-        if delay_trial is not None:
-            alternatives = (
-                (timestamp_action,),
-                (make_parameter_action(analysis, delay_trial.change),),
-            )
-        else:
-            actions.append(timestamp_action)
-    elif delay_trial is not None:
-        actions.append(make_parameter_action(analysis, delay_trial.change))
-    elif general_action is not None and not (_is_setting_fault(finding) and ranked_cause.trials):
-        actions.append(general_action)
-    for (filter_name, kind), trial in trial_by_filter_and_kind.items():
+        sender_actions = [
+            Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
+        ]
+    alternatives: tuple[tuple[Action, ...], ...] = ()
+    actions = delay_actions or sender_actions
+    if offset_trial and delay_trial:
+        actions, alternatives = [], (tuple(sender_actions), tuple(delay_actions))
+    elif (
+        not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
+    ):
+        actions = []
+    for (filter_name, kind), trial in trials.items():
         if (
             filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            has_consistent_defaults = (
-                "kf",
-                "defaults",
-            ) in trial_by_filter_and_kind and kind == "noises"
-            default_settings = (
-                trial_by_filter_and_kind["kf", "defaults"].change if has_consistent_defaults else {}
-            )
+            default_trial = trials.get(("kf", "defaults")) if kind == "noises" else None
+            default_settings = default_trial.change if default_trial else {}
             actions.append(make_rerun_action(request, trial.change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
             parameters = {name: value for name, value in trial.change.items() if name in PARAMETERS}
@@ -259,10 +246,8 @@ def _no_change_reason(
     if not word_by_reference:
         return ""
     if set(word_by_reference.values()) == {"consistent"}:
-        if (
-            "truth" not in word_by_reference
-            and CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        ):
+        is_hidden = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        if is_hidden and "truth" not in word_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -270,9 +255,8 @@ def _no_change_reason(
             return "no option of KF rejects outliers; do not increase SIGMA_Z (--sigma-z) instead"
         if word_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
-    return (
-        f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
-    )
+    effect = "removes drift" if finding.id == "source_drift" else "corrects this fault"
+    return f"no setting {effect}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
@@ -290,8 +274,8 @@ def make_rerun_action(
     """
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
-        f"{COMPARISON_OPTIONS[name]} (default {default_settings[name]:g})"
-        for name in default_settings
+        f"{COMPARISON_OPTIONS[name]} (default {value:g})"
+        for name, value in default_settings.items()
     )
     sentence = f"run again without {options}, or with the estimated noises" if options else ""
     return Action("KF", sentence, (command,), "shell")
@@ -310,51 +294,39 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    outcome_before, outcome_after = trial.before, trial.after
-    ratios_before, ratios_after = ratios(outcome_before), ratios(outcome_after)
-    before_and_after_by_field: dict[str, Any] = {
-        "position_rmse_m": (outcome_before.position_rmse_m, outcome_after.position_rmse_m),
-        "source_ratio": (ratios_before.get("source"), ratios_after.get("source")),
-        "truth_ratio": (ratios_before.get("truth"), ratios_after.get("truth")),
+    outcomes = trial.before, trial.after
+    rejected_fractions = [outcome.rejected_fraction for outcome in outcomes]
+    before_and_after: dict[str, Any] = {
+        "position_rmse_m": [outcome.position_rmse_m for outcome in outcomes],
+        "source_ratio": [ratios(outcome).get("source") for outcome in outcomes],
+        "truth_ratio": [ratios(outcome).get("truth") for outcome in outcomes],
     }
-    rejected_fractions = (
-        outcome_before.rejected_fraction or 0.0,
-        outcome_after.rejected_fraction or 0.0,
-    )
-    if max(rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
-        before_and_after_by_field["rejected_fraction"] = (
-            outcome_before.rejected_fraction,
-            outcome_after.rejected_fraction,
-        )
+    if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
+        before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(
         label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=improvement(trial),
-        **{
-            name: before_and_after
-            for name, before_and_after in before_and_after_by_field.items()
-            if None not in before_and_after
-        },
+        **{name: tuple(pair) for name, pair in before_and_after.items() if None not in pair},
     )
 
 
 def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
-    kind = trial.kinds[0]
+    kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
     if OUTLIERS in trial.change:
-        filter_label = "KF" if trial.filter == "kf" else "EKF2 (replay)"
-        return f"{filter_label} without the {trial.change[OUTLIERS]:.0f}"
+        return f"{label} without the {trial.change[OUTLIERS]:.0f}"
     if trial.filter == "kf":
         options = " ".join(
-            f"{COMPARISON_OPTIONS[filter_label]} {value:g}"
-            for filter_label, value in trial.change.items()
-            if filter_label in (SIGMA_A, SIGMA_Z)
+            f"{COMPARISON_OPTIONS[name]} {value:g}"
+            for name, value in trial.change.items()
+            if name in (SIGMA_A, SIGMA_Z)
         )
         prefix = "default " if kind == "defaults" else ""
-        return f"KF, {prefix}{options}" if options else "KF"
+        return f"{label}, {prefix}{options}" if options else label
     if sum(other_trial.filter == "ekf2" for other_trial in trials) < 2:
-        return "EKF2 (replay)"
-    return f"EKF2 (replay), {'sender' if kind == 'time offset' else 'parameters'}"
+        return label
+    return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"
 
 
 def _closing_sentence(
@@ -368,17 +340,15 @@ def _closing_sentence(
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises, and with the estimated noises."
-    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
+    tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
-        if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
-            continue
-        default_noise_m = analysis.flight.log.default_of(next(iter(trial.change)))
-        sigma_z = horizontal_tuning.sigma_z
-        if (sigma_z.low or 0.0) <= default_noise_m <= (sigma_z.high or 0.0):
-            return (
-                f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
-                "estimate, so it is equally good."
-            )
+        if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
+            default_m = analysis.flight.log.default_of(next(iter(trial.change)))
+            if (tuning.sigma_z.low or 0.0) <= default_m <= (tuning.sigma_z.high or 0.0):
+                return (
+                    f"PX4's default of {default_m:g} m is inside the 95 % interval of the "
+                    "estimate, so it is equally good."
+                )
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]

@@ -36,7 +36,7 @@ def axis_fraction(ratio: float) -> float:
     return (math.log10(ratio) - log_low) / (log_high - log_low)
 
 
-class Verdict(Record, frozen=True, kw_only=True):
+class Verdict(Record, kw_only=True):
     """Verdict on the reported σ of KF or EKF2, from its innovations or its errors.
 
     Attributes
@@ -67,7 +67,7 @@ class Verdict(Record, frozen=True, kw_only=True):
         return self.word in ("overconfident", "underconfident") and not self.is_explained
 
 
-class Effect(Record, frozen=True, kw_only=True):
+class Effect(Record, kw_only=True):
     """Position errors of KF and EKF2, and rejections and resets of EKF2.
 
     Attributes
@@ -88,7 +88,7 @@ class Effect(Record, frozen=True, kw_only=True):
     horizontal_resets: Count | None = None
 
 
-class Action(Record, frozen=True):
+class Action(Record):
     """Action against a fault: commands to paste, or a sentence.
 
     Attributes
@@ -107,7 +107,7 @@ class Action(Record, frozen=True):
     where: Literal["shell", "console", ""] = ""
 
 
-class Rerun(Record, frozen=True, kw_only=True):
+class Rerun(Record, kw_only=True):
     """Statistics of KF or EKF2 before and after one change of a setting or of the data.
 
     Attributes
@@ -130,7 +130,7 @@ class Rerun(Record, frozen=True, kw_only=True):
     improves: Improvement
 
 
-class Cause(Record, frozen=True, kw_only=True):
+class Cause(Record, kw_only=True):
     """Fault of the flight with its effect, actions and re-runs.
 
     Attributes
@@ -158,7 +158,7 @@ class Cause(Record, frozen=True, kw_only=True):
     after: str = ""
 
 
-class Note(Record, frozen=True):
+class Note(Record):
     """Finding of severity "note"."""
 
     id: str
@@ -166,7 +166,7 @@ class Note(Record, frozen=True):
     action: str = ""
 
 
-class Identity(Record, frozen=True, kw_only=True):
+class Identity(Record, kw_only=True):
     """Flight, software versions and settings of a diagnosis card.
 
     Attributes
@@ -198,7 +198,7 @@ class Identity(Record, frozen=True, kw_only=True):
     version: str = ""
 
 
-class AidRow(Record, frozen=True, kw_only=True):
+class AidRow(Record, kw_only=True):
     """RMS of innovation ÷ √S along one axis of an EKF2 aiding source.
 
     ``is_usual`` is True if PX4's default noise of this aiding source is usually too large.
@@ -210,7 +210,7 @@ class AidRow(Record, frozen=True, kw_only=True):
     is_usual: bool = False
 
 
-class Card(Record, frozen=True, kw_only=True):
+class Card(Record, kw_only=True):
     """Diagnosis of a flight: headline, effect, actions, verdicts and causes.
 
     Attributes

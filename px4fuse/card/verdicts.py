@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
-from px4fuse.comparison.model import AxisComparison, FilterSummary
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
@@ -23,12 +23,9 @@ MIN_BOOTSTRAP_BLOCKS = 4
 def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     """Return the verdicts along one axis: KF and EKF2, each against source and ground truth."""
     return tuple(
-        verdict
-        for filter_name in ("kf", "ekf2")
-        for verdict in (
-            _verdict_against_source(result, filter_name),
-            _verdict_against_truth(result, filter_name),
-        )
+        judge(result, filter_name)
+        for filter_name in FILTERS
+        for judge in (_verdict_against_source, _verdict_against_truth)
     )
 
 
@@ -85,12 +82,8 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     starts = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
     ends = np.searchsorted(time_s, time_s[starts] + BOOTSTRAP_BLOCK_S)
     cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
-    drawn_starts = np.random.default_rng(0).integers(
-        len(starts), size=(BOOTSTRAP_RESAMPLES, block_count)
-    )
-    drawn_square_sums = (cumulative_squares[ends] - cumulative_squares[starts])[drawn_starts].sum(
-        axis=1
-    )
-    drawn_counts = (ends - starts)[drawn_starts].sum(axis=1)
-    low, high = np.percentile(np.sqrt(drawn_square_sums / drawn_counts), (2.5, 97.5))
+    block_squares = cumulative_squares[ends] - cumulative_squares[starts]
+    drawn = np.random.default_rng(0).integers(len(starts), size=(BOOTSTRAP_RESAMPLES, block_count))
+    mean_squares = block_squares[drawn].sum(axis=1) / (ends - starts)[drawn].sum(axis=1)
+    low, high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
     return float(low), float(high)

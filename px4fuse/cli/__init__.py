@@ -6,6 +6,7 @@ import gc
 import importlib
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -16,7 +17,7 @@ import click
 from px4fuse.cli.outputs import Interrupted, written_so_far
 from px4fuse.core.input_files import inputs_protected
 from px4fuse.core.threads import ONE_THREAD
-from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
+from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
 
 # Names of the commands, in the order of --help: each one is function NAME in the module cli/NAME.py
 COMMANDS = (
@@ -76,16 +77,11 @@ class LazyGroup(click.Group):
         """Find the command; for an unknown name, fail with a suggestion."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-"):
-            import difflib
-            import shlex
-
-            message = f"Unknown command {name!r}."
-            if close_matches := difflib.get_close_matches(name.lower(), COMMANDS):
-                message += f" Did you mean {close_matches[0]!r}?"
-            elif Path(name).is_file():
+            message = f"Unknown command {name!r}. {suggest_name(name.lower(), COMMANDS)}"
+            if Path(name).is_file():
                 command = shlex.join(["px4fuse", "compare", *args])
                 message = f"{name!r} is a file, not a command. Did you mean: {command}?"
-            ctx.fail(message)
+            ctx.fail(message.rstrip())
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
@@ -94,16 +90,14 @@ class LazyGroup(click.Group):
             with inputs_protected():
                 return super().invoke(ctx)
         except Px4FuseError as error:
-            error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
+            error.args = (_with_option_names(str(error), ctx.invoked_subcommand or ""),)
             raise
         except BrokenPipeError as error:
             # the new error has no errno, because click ends the command with exit code 1 for EPIPE
             raise BrokenPipeError from error
         except KeyboardInterrupt as interrupt:  # click would print an empty line
             raise Interrupted(interrupt, written_so_far(ctx)) from None
-        except MemoryError as error:
-            raise _make_system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
-        except OSError as error:
+        except (MemoryError, OSError) as error:
             raise _make_system_error(error, written_so_far(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -132,8 +126,8 @@ def cli() -> None:
     """
 
 
-def _make_system_error(error: OSError, written_text: str) -> Px4FuseError:
-    if error.errno == errno.ENOMEM:
+def _make_system_error(error: MemoryError | OSError, written_text: str) -> Px4FuseError:
+    if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return Px4FuseError(
             f"not enough memory; {written_text}",
             "Close other programs, or raise the limit (ulimit -v).",
@@ -192,12 +186,9 @@ def main() -> None:
         command_name = error.ctx.command_path if error.ctx else "px4fuse"
         _print_error(f"{error.format_message()} See {command_name} --help.")
         exit_code = 2
-    except Px4FuseError as error:
+    except (Px4FuseError, Interrupted) as error:
         _print_error(str(error))
-        exit_code = 2
-    except Interrupted as interrupt:
-        _print_error(str(interrupt))
-        exit_code = interrupt.exit_code
+        exit_code = getattr(error, "exit_code", 2)
     except BrokenPipeError:  # the program that reads the pipe has ended
         _discard_output()
         exit_code = 0
@@ -242,18 +233,15 @@ def _redirect_closed_streams() -> None:
             setattr(sys, name, open(descriptor, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
 
 
-def _with_option_names(text: str, command: str | None) -> str:
+def _with_option_names(text: str, command: str) -> str:
     """Replace names of Python arguments in an error text by the options of the command."""
-    from px4fuse.request import (
-        COMPARISON_OPTIONS,
-        OPTION_NAMES,
-        EvaluationRequest,
-        LoopRequest,
-        with_options,
-    )
+    from px4fuse import request
 
-    option_names = {"loop": OPTION_NAMES[LoopRequest], "evaluate": OPTION_NAMES[EvaluationRequest]}
-    return with_options(text, option_names.get(command or "", COMPARISON_OPTIONS))
+    option_names = {
+        "loop": request.OPTION_NAMES[request.LoopRequest],
+        "evaluate": request.OPTION_NAMES[request.EvaluationRequest],
+    }
+    return request.with_options(text, option_names.get(command, request.COMPARISON_OPTIONS))
 
 
 def _print_error(text: str) -> None:

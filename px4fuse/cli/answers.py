@@ -5,12 +5,12 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import InputPath, output_option
+from px4fuse.cli.options import log_argument, output_option
 from px4fuse.cli.outputs import write_new
 
 
 @click.command()
-@click.argument("log", type=InputPath())
+@log_argument
 @output_option("FILE.toml", "Answer form to write (TOML).  [default: LOG.answers.toml beside LOG]")
 def answers(log: Path, output: Path | None) -> None:
     """Write an empty form for a student's diagnosis of a flight.

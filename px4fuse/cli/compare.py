@@ -2,40 +2,32 @@
 
 import sys
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import LogError, MissingDataError
+from px4fuse.finding import SEVERITIES, Severity
 from px4fuse.request import settings_name
-
-Severity = Literal["error", "warning", "note"]
-SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=options.InputPath())
+@options.log_argument
 @options.analysis_options
 @options.student_options
 @options.report_options(
     "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )
 @options.fail_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
-@click.option(
+@options.flag(
     "--checks",
-    is_flag=True,
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
     "long time.",
 )
-@click.option(
-    "-v",
-    "--verbose",
-    is_flag=True,
-    help="Print all findings, axes and KF settings on the terminal.",
-)
-@click.option("-q", "--quiet", is_flag=True, help="Print the diagnosis on one line only.")
+@options.flag("-v", "--verbose", help="Print all findings, axes and KF settings on the terminal.")
+@options.flag("-q", "--quiet", help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
     log: Path,
@@ -69,9 +61,14 @@ def compare(
             outcome = diagnose_or_check_aids(request, show_progress)
             results = outcome_results(request, outcome, student)
             release_free_memory()  # the report modules, imported next, need memory
-            if output is None and json_path is None:
-                output = outputs.default_report(log.stem, settings_name(request), results)
-            contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+            contents = outputs.result_files(
+                results,
+                json_path,
+                output,
+                outcome,
+                show_progress,
+                log.stem + settings_name(request),
+            )
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # programs that read standard error expect one line
             raise
@@ -86,10 +83,5 @@ def compare(
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if failed_findings:
         sys.exit(1)
-    if fail_on is not None:
-        failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(
-            finding.severity in failing_severities and finding.caused_by is None
-            for finding in results.findings
-        ):
-            sys.exit(1)
+    causes = [finding for finding in results.findings if finding.caused_by is None]
+    options.exit_for_severity(fail_on, SEVERITIES, {finding.severity for finding in causes})

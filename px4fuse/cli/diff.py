@@ -27,7 +27,6 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     from px4fuse.batch.changes import diff as compare_inputs
     from px4fuse.batch.terminal import format_differences
 
-    outputs.check_targets([json_path])  # report an invalid output path before the long analysis
     with outputs.progress(json_path) as show_progress:
         results = compare_inputs(a, b, progress=show_progress)
     outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))

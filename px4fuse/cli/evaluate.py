@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 
 # Maximum RPE delta (m, s or frames)
 MAX_RPE_DELTA = 1e6
-# Options that are passed to px4fuse.trajectory.evaluation.evaluate as arguments
-SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -35,6 +34,9 @@ def parse_delta(text: str) -> Delta:
     return Delta(float(match[1]), unit)  # type: ignore[arg-type]
 
 
+_evaluation_option = partial(options.request_option, EvaluationRequest)
+
+
 @click.command()
 @click.argument("estimate", type=options.InputPath())
 @click.argument("reference", type=options.InputPath())
@@ -46,35 +48,27 @@ def parse_delta(text: str) -> Delta:
     help="Delta of the RPE: a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
     "[default: several distances that fit the path length]",
 )
-@click.option(
-    "--alignment",
-    type=options.Choice(("none", "yaw", "se3", "sim3")),
-    help="Transform of the estimate that is fitted to the reference before errors are computed.  "
+@_evaluation_option(
+    "alignment",
+    "Transform of the estimate that is fitted to the reference before errors are computed.  "
     "[default: yaw for VIO, EKF2 and KF; se3 for SLAM; sim3 for monocular SLAM]",
 )
-@click.option(
-    "--association",
-    type=options.Choice(("interpolate", "nearest")),
-    default="interpolate",
-    help="Reference pose for an estimated pose: interpolated, or nearest in time (as in evo).",
+@_evaluation_option(
+    "association",
+    "Reference pose for an estimated pose: interpolated, or nearest in time (as in evo).",
 )
-@click.option(
-    "--max-gap",
+@_evaluation_option(
     "max_gap_s",
-    type=options.TypedQuantity("s"),
-    help="Maximum gap in the reference for interpolation (s); with --association nearest, the "
+    "Maximum gap in the reference for interpolation (s); with --association nearest, the "
     "maximum time difference.  [default: from the rate of the reference; 0.01 s for nearest]",
 )
-@click.option(
-    "--time-offset",
+@_evaluation_option(
     "time_offset_s",
-    type=options.TypedQuantity("s", auto=True),
-    help="Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
+    "Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
     "[default: auto if the two trajectories do not overlap in time, else 0]",
 )
-@click.option(
+@options.flag(
     "--consecutive",
-    is_flag=True,
     help="Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
 )
 @options.system_option
@@ -121,13 +115,14 @@ def evaluate(
             reference_source.trajectory,
             rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
-            **{name: option_values[name] for name in SCORE_OPTIONS},
+            alignment=request.alignment,
+            association=request.association,
+            max_gap_s=request.max_gap_s,
+            time_offset_s=request.time_offset_s,
         )
         results = evaluation_results(request, evaluation)
-        if output is None and json_path is None:
-            name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = outputs.default_report(name, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, evaluation, show_progress)
+        name = f"{file_name(estimate)}_against_{file_name(reference)}{settings_name(request)}"
+        contents = outputs.result_files(results, json_path, output, evaluation, show_progress, name)
     page = Page()
     write_evaluation(page, evaluation)
     outputs.write_and_print(contents, page)

@@ -1,20 +1,17 @@
 """Command ``px4fuse extract``: exports a log as tables."""
 
-from __future__ import annotations
-
 import importlib.util
-import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from px4fuse.cli.options import (
     Choice,
-    InputPath,
     comparison_request,
     flight_options,
+    log_argument,
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
@@ -22,15 +19,12 @@ from px4fuse.core.input_files import check_output_folder, inputs_not_registered
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 # Maximum size (bytes) of flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
-@click.argument("log", type=InputPath())
+@log_argument
 @output_option("DIR", "Output folder for the tables.", required=True)
 @click.option(
     "--format",
@@ -63,9 +57,13 @@ def extract(
     flight = extraction.with_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
-    encode = _parquet_bytes if format == "parquet" else _csv_bytes
-    contents = {output / f"{name}.{format}": encode(table) for name, table in tables.items()}
-    contents[output / "data_dictionary.csv"] = _csv_bytes(extraction.data_dictionary(flight))
+    contents = {
+        output / f"{name}.{format}": extraction.to_bytes(table, format)
+        for name, table in tables.items()
+    }
+    contents[output / "data_dictionary.csv"] = extraction.to_bytes(
+        extraction.data_dictionary(flight), "csv"
+    )
     contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
@@ -81,23 +79,11 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
         with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
-        is_other_log = earlier_log["sha256"] != sha256
-        name = str(earlier_log["name"])
+        name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
     # the file does not exist, or is not a flight.json of px4fuse
     except (OutputError, ValueError, KeyError, TypeError):
         return
-    if is_other_log:
+    if earlier_sha256 != sha256:
         raise OutputError(
             f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
         )
-
-
-def _csv_bytes(table: pd.DataFrame) -> bytes:
-    # pandas writes enough digits to read the same float64 again
-    return table.to_csv(index=False, lineterminator="\n").encode()
-
-
-def _parquet_bytes(table: pd.DataFrame) -> bytes:
-    buffer = io.BytesIO()
-    table.to_parquet(buffer, engine="pyarrow", index=False)
-    return buffer.getvalue()

@@ -1,10 +1,8 @@
 """Command ``px4fuse grade``: verifies and grades the reports of a class."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any
 
 import click
 
@@ -12,6 +10,8 @@ from px4fuse.cli.options import (
     Choice,
     InputPath,
     NonEmptyPath,
+    count_option,
+    flag,
     input_option,
     max_size_option,
     open_option,
@@ -21,10 +21,6 @@ from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_ne
 from px4fuse.core.input_files import add_input, check_output_folder
 from px4fuse.core.reading import files_below
 from px4fuse.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from px4fuse.classroom.grading.grade import GradeOutcome
-    from px4fuse.report.page import Page
 
 
 @click.command()
@@ -43,16 +39,12 @@ if TYPE_CHECKING:
 )
 @max_size_option
 @input_option(
-    "--key",
-    "FILE.json",
-    "Answer key of the class, written by px4fuse simulate --assignment.",
+    "--key", "FILE.json", "Answer key of the class, written by px4fuse simulate --assignment."
 )
 @output_option("DIR", "Output folder for the class table and the feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
 @input_option(
-    "--roster",
-    "FILE.csv",
-    "Class list with all students.  [default: the students in --key]",
+    "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
 )
 @click.option(
     "--attempt",
@@ -86,18 +78,14 @@ if TYPE_CHECKING:
     help="Maximum points on the learning platform, to which the grades in --worksheet are scaled.  "
     "[default: the points of the rubric]",
 )
-@click.option(
+@count_option(
     "--questions",
-    type=click.IntRange(1, 10),
-    metavar="N",
+    1,
+    10,
     help="Write questions.txt: N questions to each student for an oral check, from the student's "
     "own form and flight, with the expected answers. Requires --key.",
 )
-@click.option(
-    "--include-pending",
-    is_flag=True,
-    help="Count points that the instructor has not confirmed yet.",
-)
+@flag("--include-pending", help="Count points that the instructor has not confirmed yet.")
 @input_option(
     "--worksheet",
     "FILE.csv",
@@ -108,15 +96,14 @@ if TYPE_CHECKING:
 @click.option(
     "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."
 )
-@click.option(
+@flag(
     "--anonymous",
-    is_flag=True,
     help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
 )
-@click.option(
+@count_option(
     "--jobs",
-    type=click.IntRange(1, 256),
-    metavar="N",
+    1,
+    256,
     help="Number of reports that are processed in parallel.  [default: number of cores]",
 )
 @click.option(
@@ -133,20 +120,12 @@ def grade(
     rubric: Path | None,
     key: Path | None,
     output: Path | None,
-    title: str | None,
     roster: Path | None,
-    attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
-    grace: float,
-    scale: float | None,
-    questions: int | None,
-    include_pending: bool,
-    worksheet: tuple[Path, ...],
-    column: str | None,
-    anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
+    **option_values: Any,
 ) -> None:
     """Verify and grade the reports of a class.
 
@@ -161,37 +140,34 @@ def grade(
     from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
     from px4fuse.classroom.grading.grade import grade as grade_submissions
     from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
+    from px4fuse.classroom.terminal import grading_page
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    late_deduction = parse_late_rule(late) if late else None
-    if late_deduction is not None and due is None:
+    if late and due is None:
         raise SettingsError("--late requires --due TIME.")
-    if questions and key is None:
+    question_count = option_values.pop("questions") or 0
+    if question_count and key is None:
         raise SettingsError("--questions requires --key FILE.json.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("px4fuse grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
-    answer_key = None if key is None else read_key(key)
     course = Course(
         read_rubric(rubric),
-        answer_key,
+        None if key is None else read_key(key),
         logs,
-        title or "",
+        option_values.pop("title") or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
-        worksheets=tuple(map(read_sheet, worksheet)),
-        column=column or "",
-        attempt=attempt,
+        worksheets=tuple(map(read_sheet, option_values.pop("worksheet"))),
+        column=option_values.pop("column") or "",
         due=parse_due_time(due) if due else None,
-        late_rule=late_deduction,
-        grace_s=60.0 * grace,
-        scale=scale,
-        question_count=questions or 0,
-        include_pending=include_pending,
-        anonymous=anonymous,
+        late_rule=parse_late_rule(late) if late else None,
+        grace_s=60.0 * option_values.pop("grace"),
+        question_count=question_count,
+        **option_values,
     )
     try:
         with progress() as show_progress:
@@ -205,7 +181,7 @@ def grade(
     except KeyboardInterrupt as interrupt:
         message = f"results of verified reports are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
-    write_and_print({}, _grading_page(outcome), written_files=outcome.written_paths)
+    write_and_print({}, grading_page(outcome), written_files=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
@@ -222,41 +198,3 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
         for file in files_below(path):
             add_input(file)
     check_output_folder(output)
-
-
-def _grading_page(outcome: GradeOutcome) -> Page:
-    from collections import Counter
-
-    from px4fuse.core.text import one_line
-    from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-
-    page, rows = Page(), []
-    for entry in outcome.entries:
-        attempt = entry.counted_report
-        pending = ", pending" if attempt and entry.total is None else ""
-        status = attempt.status + pending if attempt else "missing"
-        status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
-        total = "–" if entry.total is None else f"{entry.total:g}"
-        name = one_line(entry.student or entry.student_id, 60)
-        file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
-    page.table(
-        ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
-    )
-    counts = Counter(attempt.status for attempt in outcome.reports)
-    status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing_count = sum(entry.counted_report is None for entry in outcome.entries)
-    page.write(
-        f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
-        f"{outcome.reused_count} submissions"
-    )
-    for entry in outcome.entries:
-        report = entry.counted_report
-        if report is not None and entry.total is None:
-            name = one_line(entry.display_name, 60)
-            page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
-    for note in outcome.notes:
-        page.write(note, colour=MUTED_COLOUR)
-    return page

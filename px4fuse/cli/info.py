@@ -1,24 +1,12 @@
 """Command ``px4fuse info``: lists the contents of a log and the possible analyses."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from px4fuse.cli.options import InputPath, comparison_request, flight_options, json_option
-from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
-from px4fuse.core.record import Unavailable
-from px4fuse.core.text import join_first
-
-if TYPE_CHECKING:
-    from px4fuse.info.inventory import Inventory, Source
-    from px4fuse.report.page import Cell, Page
-    from px4fuse.request import ComparisonRequest
-
-SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
+from px4fuse.cli.options import comparison_request, flag, flight_options, json_option, log_argument
+from px4fuse.cli.outputs import progress, result_files, write_and_print
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
@@ -36,10 +24,9 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
 
 
 @click.command()
-@click.argument("log", type=InputPath())
-@click.option(
+@log_argument
+@flag(
     "--versions",
-    is_flag=True,
     is_eager=True,
     expose_value=False,
     callback=_print_versions,
@@ -55,171 +42,12 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """
     from px4fuse.diagnose import read_flight
     from px4fuse.info.inventory import take_inventory, to_json_dict
+    from px4fuse.report.inventory import summary
 
     request = comparison_request(log, option_values)
-    check_targets([json_path])
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
     contents = result_files(to_json_dict(inventory), json_path)
-    write_and_print(contents, _inventory_page(inventory, request))
-
-
-def _inventory_page(inventory: Inventory, request: ComparisonRequest) -> Page:
-    from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
-    from px4fuse.request import command_line
-
-    page = Page()
-    page.write(inventory.flight.log.name, bold=True)
-    for label, text in _describe_log(inventory):
-        page.write_labelled(label, text)
-    if inventory.flight.log.senders:
-        page.table(
-            ("sender", "type", "messages", "lost"),
-            _sender_rows(inventory),
-            right_aligned_columns=(2, 3),
-        )
-    page.table(SOURCES_HEAD, list(_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5))
-    answer_styles = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
-    rows = [
-        (answer_styles[option.possible], option.name, option.reason)
-        for option in inventory.abilities
-    ]
-    page.table(("possible", "analysis", ""), rows)
-    if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
-        command = command_line(request, "compare", for_shell=True)
-        page.add("command", text=command, label="Run")
-    lists = {
-        "Action": [
-            f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
-        ],
-        "Clocks": _clock_lines(inventory),
-        "Not used": [
-            f"{topic.name}, {topic.count} messages: {topic.reason}"
-            for topic in inventory.flight.unused
-        ],
-        "Notes": inventory.notes,
-    }
-    for label, texts in lists.items():
-        if texts:
-            page.write_labelled(label, *texts)
-    return page
-
-
-def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
-    log = inventory.flight.log
-    size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
-    version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
-    git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
-    hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware
-    labelled_texts = [
-        ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
-        ("Vehicle", f"{version}{git}, {hardware}"),
-        ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
-        ("Airborne", _airborne_text(inventory)),
-    ]
-    if log.dropouts:
-        lost_s = sum(dropout.duration_s for dropout in log.dropouts)
-        longest_s = max(dropout.duration_s for dropout in log.dropouts)
-        count = len(log.dropouts)
-        text = f"{count} logger dropouts of {lost_s:.2f} s in total, at most {longest_s:.2f} s"
-        labelled_texts.append(("Dropouts", text))
-    labelled_texts += [
-        (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
-        for file in inventory.flight.inputs
-    ]
-    return labelled_texts
-
-
-def _duration_text(seconds: float) -> str:
-    if not seconds:
-        return "all samples have the same timestamp"
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s"
-
-
-def _start_text(inventory: Inventory) -> str:
-    if inventory.start_utc is None:
-        boot_time_s = inventory.flight.log.boot_time_s
-        return f"the data start {boot_time_s:.1f} s after boot (the log contains no UTC)"
-    return f"the data start at {inventory.start_utc[:19].replace('T', ' ')} UTC"
-
-
-def _airborne_text(inventory: Inventory) -> str:
-    airborne = inventory.flight.airborne
-    if isinstance(airborne, Unavailable):
-        return "unknown (the log contains no land detector)"
-    if not airborne:
-        return "the land detector never reported a flight"
-    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
-    return join_first(spans, 3)
-
-
-def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
-    return [
-        (
-            f"{sender.system}/{sender.component}",
-            sender.description + (" (this flight)" if sender.chosen else ""),
-            f"{sender.messages}",
-            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
-        )
-        for sender in inventory.flight.log.senders
-    ]
-
-
-def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
-    from px4fuse.report.style import MUTED_COLOUR
-
-    previous_part = ""
-    for source in inventory.sources:
-        data_type = source.part if source.part != previous_part else ""
-        previous_part = source.part
-        if source.unavailable:
-            # another table contains the reason for the missing data
-            yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
-            continue
-        yield (
-            f"{data_type:8} (used)" if source.chosen else data_type,
-            source.name,
-            "" if source.samples is None else f"{source.samples}",
-            "" if source.rate_hz is None else _format_short(source.rate_hz),
-            _gaps_text(source),
-            _span_text(source),
-        )
-
-
-def _gaps_text(source: Source) -> str:
-    if source.gaps is None:
-        return ""
-    if not source.gaps.count:
-        return "0"
-    return f"{source.gaps.count} ({_format_short(source.gaps.longest_s)} s)"
-
-
-def _format_short(value: float) -> str:
-    """Format a rate (Hz) or time (s) with two or more digits, for a narrow column."""
-    return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
-
-
-def _span_text(source: Source) -> str:
-    if source.start_s is None or source.end_s is None:
-        return ""
-    digits = 1 if source.end_s < 10 else 0
-    # adding 0.0 converts -0.0 to 0.0
-    start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
-    return f"{start:.{digits}f} to {end:.{digits}f}"
-
-
-def _clock_lines(inventory: Inventory) -> list[str]:
-    from px4fuse.report.phrases import format_clock_map
-
-    names_by_clock: dict[str, dict[str, None]] = {}
-    for source in inventory.sources:
-        if source.clock:
-            name = source.name if source.part == "position" else source.part
-            names_by_clock.setdefault(source.clock, {})[name] = None
-    lines = [
-        f"{clock}: {', '.join(names_on_clock)}" for clock, names_on_clock in names_by_clock.items()
-    ]
-    return lines + [format_clock_map(clock) for clock in inventory.flight.clocks]
+    write_and_print(contents, summary(inventory, request))

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from px4fuse.cli import options, outputs
-from px4fuse.core.reading import display_name
+from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
-from px4fuse.errors import SettingsError
-from px4fuse.request import (
-    FrameName,
-    GivenClosure,
-    Landing,
-    LoopRequest,
-    command_line,
-    settings_name,
-)
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, settings_name
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
@@ -56,6 +50,9 @@ def parse_closure(text: str) -> GivenClosure:
     )
 
 
+_loop_option = partial(options.request_option, LoopRequest)
+
+
 @click.command()
 @click.argument("source", type=options.InputPath())
 @click.option(
@@ -66,10 +63,9 @@ def parse_closure(text: str) -> GivenClosure:
     "nose at take-off) and to the right (m), and the clockwise rotation (°) if known.  [default: "
     "the ground truth of the log, else 0,0]",
 )
-@click.option(
+@options.flag(
     "--open",
     "opened",
-    is_flag=True,
     help="Do not use the landing as a loop closure, because the vehicle did not return to the "
     "take-off place.",
 )
@@ -82,25 +78,22 @@ def parse_closure(text: str) -> GivenClosure:
     help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s), within SIGMA "
     "(m, 1 σ); repeatable.  [default SIGMA: 0.1 m]",
 )
-@click.option(
+@options.flag(
     "--robust",
-    is_flag=True,
     help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
     "which takes minutes.",
 )
-@click.option(
-    "--from",
+@_loop_option(
     "start_s",
-    type=options.TypedQuantity("s", 20.0),
-    help="Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
     "[default: take-off]",
+    20.0,
 )
-@click.option(
-    "--to",
+@_loop_option(
     "end_s",
-    type=options.TypedQuantity("s", 60.0),
-    help="End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
     "[default: landing]",
+    60.0,
 )
 @click.option(
     "--reference",
@@ -109,32 +102,21 @@ def parse_closure(text: str) -> GivenClosure:
     help="Reference trajectory (for example from SLAM) for the ATE and RPE of each path, in "
     "addition to the ground truth of the log.",
 )
-@click.option(
-    "--drift",
+@_loop_option(
     "position_drift_m",
-    type=options.TypedQuantity("m", 1.0),
-    default=1.0,
-    help="Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Position drift (m, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
-@click.option(
-    "--heading-drift",
+@_loop_option(
     "heading_drift_deg",
-    type=options.TypedQuantity("°", 3.0),
-    default=3.0,
-    help="Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
+    "Heading drift (°, 1 σ) of the odometry after 100 m; a weight in the pose graph.",
 )
-@click.option(
-    "--key-frames",
+@_loop_option(
     "key_frames_m",
-    type=options.TypedQuantity("m", 0.2),
-    help="Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
+    "Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
     "the path, 0.02 to 0.5 m]",
+    0.2,
 )
-@click.option(
-    "--frame",
-    type=options.Choice(get_args(FrameName)),
-    help="Coordinate frame of a trajectory file.  [default: detected]",
-)
+@_loop_option("frame", "Coordinate frame of a trajectory file.  [default: detected]")
 @options.system_option
 @options.max_size_option
 @options.student_options
@@ -166,7 +148,6 @@ def loop(
     (g2o), which is optimised. LOG:vio, LOG:ekf2 or LOG:kf selects the track of a log; the default
     is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.core.reading import split_path_and_part
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o
     from px4fuse.report.loop import summary
@@ -180,19 +161,17 @@ def loop(
                 f"{name} cannot write to standard output, only --json can", "Give a file name."
             )
     if is_g2o(log):
-        _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
+        _solve_graph(source, json_path, g2o, option_values["robust"] or None)
         return
     request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as show_progress:
         loop_result = analyse_loop_closure(request, show_progress)
         results = loop_results(request, loop_result, student)
-        if output is None and json_path is None:
-            output = outputs.default_report(
-                f"{file_name(source)}_loop", settings_name(request), results
-            )
-        contents = _output_files(loop_result, tum, g2o)
-        contents |= outputs.result_files(results, json_path, output, loop_result, show_progress)
+        name = f"{file_name(source)}_loop{settings_name(request)}"
+        contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
+            results, json_path, output, loop_result, show_progress, name
+        )
     outputs.write_and_print(contents, summary(loop_result, results.findings), request)
 
 
@@ -206,7 +185,6 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
     """Return the contents of the files with the corrected path (TUM) and the pose graph (g2o)."""
-    from px4fuse.errors import MissingDataError
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
@@ -230,11 +208,10 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.core.reading import split_path_and_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results
-    from px4fuse.trajectory.graph.analysis import analyse_graph
+    from px4fuse.trajectory.graph.solver import analyse_graph
 
     path, track = split_path_and_part(str(source))
     if track is not None:
@@ -247,8 +224,7 @@ def _solve_graph(
                 f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
-    outputs.check_targets([json_path, g2o])
-    with outputs.progress(json_path) as show_progress:
+    with outputs.progress(json_path, g2o) as show_progress:
         show_progress(f"reading {display_name(source)}")
         results, solved_graph = analyse_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust

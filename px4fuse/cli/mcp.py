@@ -166,14 +166,10 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
     """Return the parameters of a command that are arguments of its tool, by argument name."""
-    command = find_command(command_name)
-    parameter_by_name = {
-        str(parameter.name): parameter for parameter in command.params if parameter.expose_value
-    }
     return {
-        ARGUMENT_NAMES.get(name, name): parameter_by_name[name]
-        for name in parameter_by_name
-        if name not in HIDDEN_PARAMETERS
+        ARGUMENT_NAMES.get(name, name): parameter
+        for parameter in find_command(command_name).params
+        if parameter.expose_value and (name := str(parameter.name)) not in HIDDEN_PARAMETERS
     }
 
 

@@ -7,32 +7,25 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 import click
 from click.core import ParameterSource
+from msgspec import Struct, structs
 
 from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import add_input
 from px4fuse.core.reading import max_log_bytes, read_log_bytes, read_text
+from px4fuse.core.text import replace_unencodable
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.request import (
-    AUTO,
-    DT_S,
-    OPTION_NAMES,
-    SIGMA_A_M_S2,
-    AxisName,
-    ComparisonRequest,
-    PositionFile,
-    PositionFrame,
-    SourceKind,
-)
+from px4fuse.request import AUTO, OPTION_NAMES, SUFFIX_UNITS, ComparisonRequest, PositionFile
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -59,7 +52,7 @@ class NonEmptyPath(click.Path):
     def __init__(self, path_type: type[Path | str] = Path) -> None:
         super().__init__(path_type=path_type)
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         if value == "":
             self.fail("the file name is empty.", param, ctx)
         return super().convert(value, param, ctx)
@@ -71,7 +64,7 @@ class InputPath(NonEmptyPath):
     A log may be followed by the name of a track: ``LOG:vio``.
     """
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
         file, separator, _ = str(path).rpartition(":")
         add_input(Path(file) if separator and not Path(path).exists() else Path(path))
@@ -95,9 +88,7 @@ class TypedQuantity(click.ParamType["float | str"]):
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str:
+    def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
         if self.auto and value == AUTO:
             return str(value)
         unit = f" in {UNIT_NAMES[self.unit]}" if self.unit else ""
@@ -123,6 +114,7 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
+log_argument = click.argument("log", type=InputPath())
 #: Option --timeout of commands that analyse logs in worker processes
 timeout_option = click.option(
     "--timeout",
@@ -167,6 +159,13 @@ def _json_option(more_text: str = "") -> Option:
 json_option = _json_option()
 
 
+flag = partial(click.option, is_flag=True)
+
+
+def count_option(name: str, low: int, high: int, **details: Any) -> Option:
+    return click.option(name, type=click.IntRange(low, high), metavar="N", **details)
+
+
 def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
     return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
 
@@ -184,14 +183,19 @@ def report_options(text: str) -> Option:
     return _combine_options(output_option("FILE.pdf", text), _json_option(json_text))
 
 
-def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    return click.option("--fail-on", type=Choice(severities), help=text)
+def fail_option(levels: tuple[str, ...], text: str) -> Option:
+    return click.option("--fail-on", type=Choice(levels), help=text)
+
+
+def exit_for_severity(fail_on: str | None, levels: Sequence[str], reached: Iterable[str]) -> None:
+    """Exit with code 1 if the level of --fail-on or a more severe level is reached."""
+    if fail_on is not None and {*reached}.intersection(levels[: levels.index(fail_on) + 1]):
+        sys.exit(1)
 
 
 def _open_flag(*names: str) -> Option:
-    return click.option(
+    return flag(
         *names,
-        is_flag=True,
         expose_value=False,
         callback=lambda ctx, _, value: ctx.meta.update({OPENS_OUTPUT_KEY: value}),
         help="Open the written report or page in its default program.",
@@ -208,11 +212,7 @@ student_options = _combine_options(
     click.option(
         "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
     ),
-    input_option(
-        "--notes",
-        "FILE.md",
-        "Text of the student (Markdown), printed in the report.",
-    ),
+    input_option("--notes", "FILE.md", "Text of the student (Markdown), printed in the report."),
     input_option(
         "--answers",
         "FILE.toml",
@@ -225,12 +225,39 @@ system_option = click.option(
     metavar="ID",
     help="MAVLink system id of the vehicle to analyse.  [default: the id with the most messages]",
 )
-_clock_option = click.option(
-    "--clock-offset",
+
+
+def request_option(
+    request_type: type[Struct], name: str, text: str, example: float = 0.1, **details: Any
+) -> Option:
+    """Declare the option of a field of a request, with the type, unit and default of the field.
+
+    RANGE in the help text stands for the range of a KF setting. ``example`` is the number that the
+    error for another text suggests. ``details`` are arguments of ``click.option``.
+    """
+    field = next(field for field in structs.fields(request_type) if field.name == name)
+    types = (field.type, *get_args(field.type))
+    literals = [each for each in types if get_origin(each) is Literal]
+    if float in types:
+        unit = next(unit for suffix, unit in SUFFIX_UNITS.items() if name.endswith(suffix))
+        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literals))
+    elif literals:
+        details["type"] = Choice(get_args(literals[0]))
+    if field.default:
+        details["default"] = field.default
+    if name in SETTING_RANGES:
+        text = text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
+    # the parameter of an option for a position file has the name of the option
+    names = () if request_type is PositionFile else (name,)
+    return click.option(OPTION_NAMES[request_type][name], *names, help=text, **details)
+
+
+_comparison_option = partial(request_option, ComparisonRequest)
+_position_option = partial(request_option, PositionFile)
+_clock_option = _comparison_option(
     "clock_offset_s",
-    type=TypedQuantity("s", auto=True),
-    help="Time (s) to add to the timestamps of the position source; auto estimates it.  [default: "
-    "0; auto with --position]",
+    "Time (s) to add to the timestamps of the position source; auto estimates it.  [default: 0; "
+    "auto with --position]",
 )
 #: Options for a position file; the names of their parameters begin with ``position``
 position_options = _combine_options(
@@ -241,115 +268,80 @@ position_options = _combine_options(
         help="Recording of the positioning system (CSV or BAG:TOPIC), used instead of the "
         "positions in LOG.",
     ),
-    click.option(
-        "--body",
-        metavar="NAME",
-        help="Body, tag or topic, if the file contains several.",
+    _position_option("body", "Body, tag or topic, if the file contains several.", metavar="NAME"),
+    _position_option(
+        "frame",
+        "Coordinate frame of x, y, z in the position file.  [default: from the column names, else "
+        "the frame with the best fit to EKF2]",
     ),
-    click.option(
-        "--position-frame",
-        type=Choice(get_args(PositionFrame)),
-        help="Coordinate frame of x, y, z in the position file.  [default: from the column names, "
-        "else the frame with the best fit to EKF2]",
+    _position_option(
+        "yaw_deg",
+        "Yaw angle (°, clockwise seen from above) by which the positions in the file are rotated; "
+        "auto estimates yaw and origin.  [default: 0]",
+        30.0,
     ),
-    click.option(
-        "--position-yaw",
-        type=TypedQuantity("°", 30.0, auto=True),
-        help="Yaw angle (°, clockwise seen from above) by which the positions in the file are "
-        "rotated; auto estimates yaw and origin.  [default: 0]",
-    ),
-    click.option(
-        "--position-columns",
+    _position_option(
+        "columns",
+        "Names or numbers of the columns of the position file; SIGMA is the standard deviation of "
+        "the position.  [default: detected from the names]",
         type=lambda names: tuple(names.split(",")),
         metavar="TIME,X,Y,Z[,SIGMA]",
-        help="Names or numbers of the columns of the position file; SIGMA is the standard "
-        "deviation of the position.  [default: detected from the names]",
     ),
-    click.option(
-        "--position-time-unit",
-        type=Choice(("s", "ms", "us", "ns")),
-        help="Unit of the times in the position file.  [default: detected]",
-    ),
-    click.option(
-        "--position-unit",
-        type=Choice(("m", "cm", "mm")),
-        help="Unit of x, y, z in the position file.  [default: detected]",
-    ),
+    _position_option("time_unit", "Unit of the times in the position file.  [default: detected]"),
+    _position_option("length_unit", "Unit of x, y, z in the position file.  [default: detected]"),
 )
 #: Options for the KF settings, the axes, the time span and the position source
 filter_options = _combine_options(
-    click.option(
-        "--sigma-a",
+    _comparison_option(
         "sigma_a_m_s2",
-        type=TypedQuantity("m/s²", SIGMA_A_M_S2),
-        default=SIGMA_A_M_S2,
-        help="KF process noise SIGMA_A: σ of the acceleration error over one step DT, {:g} to {:g} "
-        "m/s².".format(*SETTING_RANGES["sigma_a_m_s2"]),
+        "KF process noise SIGMA_A: σ of the acceleration error over one step DT, RANGE.",
     ),
-    click.option(
-        "--sigma-z",
+    _comparison_option(
         "sigma_z_m",
-        type=TypedQuantity("m"),
-        help="KF measurement noise SIGMA_Z: σ of a measured position, {:g} to {:g} m.  [default: "
-        "0.1; for GNSS √R of EKF2]".format(*SETTING_RANGES["sigma_z_m"]),
+        "KF measurement noise SIGMA_Z: σ of a measured position, RANGE.  [default: 0.1; for GNSS "
+        "√R of EKF2]",
     ),
-    click.option(
-        "--dt",
-        "dt_s",
-        type=TypedQuantity("s"),
-        default=DT_S,
-        help="KF prediction interval DT, {:g} to {:g} s.".format(*SETTING_RANGES["dt_s"]),
+    _comparison_option("dt_s", "KF prediction interval DT, RANGE."),
+    _comparison_option(
+        "input",
+        "KF input: acceleration measured by the IMU, or zero (constant velocity).  [default: imu "
+        "if logged]",
     ),
-    click.option(
-        "--input",
-        type=Choice(("imu", "zero")),
-        help="KF input: acceleration measured by the IMU, or zero (constant velocity).  [default: "
-        "imu if logged]",
-    ),
-    click.option(
-        "--axis",
+    _comparison_option(
         "axes",
-        type=Choice(get_args(AxisName)),
+        "Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all axes "
+        "with a position; for GNSS the horizontal axes]",
         multiple=True,
-        help="Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all "
-        "axes with a position; for GNSS the horizontal axes]",
     ),
-    click.option(
-        "--heading",
+    _comparison_option(
         "heading_deg",
-        type=TypedQuantity("°", 30.0),
-        help="Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
+        "Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
         "track]",
+        30.0,
     ),
-    click.option(
-        "--start",
+    _comparison_option(
         "start_s",
-        type=TypedQuantity("s", 20.0),
-        help="Start of the analysed time span (s after the first data).  [default: take-off]",
+        "Start of the analysed time span (s after the first data).  [default: take-off]",
+        20.0,
     ),
-    click.option(
-        "--end",
-        "end_s",
-        type=TypedQuantity("s", 60.0),
-        help="End of the analysed time span (s after the first data).  [default: landing]",
+    _comparison_option(
+        "end_s", "End of the analysed time span (s after the first data).  [default: landing]", 60.0
     ),
-    click.option(
-        "--position-source",
-        metavar="NAME",
-        help="Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
+    _comparison_option(
+        "position_source",
+        "Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
         "sources.  [default: the logged source with the fewest processing steps]",
+        metavar="NAME",
     ),
-    click.option(
-        "--source-kind",
-        type=Choice(get_args(SourceKind)),
-        help="Kind of the position source; only vio may drift.  [default: from the messages; vio "
-        "if they contain a changing orientation]",
+    _comparison_option(
+        "source_kind",
+        "Kind of the position source; only vio may drift.  [default: from the messages; vio if "
+        "they contain a changing orientation]",
     ),
-    click.option(
-        "--height",
-        type=Choice(("gnss", "barometer")),
-        help="Height source of the axis down on a flight with GNSS.  [default: the source that "
-        "EKF2 fused, GNSS first]",
+    _comparison_option(
+        "height",
+        "Height source of the axis down on a flight with GNSS.  [default: the source that EKF2 "
+        "fused, GNSS first]",
     ),
 )
 #: Options for the recordings of one flight, the position file and the clock offset
@@ -406,8 +398,10 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     from px4fuse.results.answer_form import read_answers
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
-    name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
-    notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
+    name, student_id, notes_path, answers_path = (
+        option_values.pop(name) for name in ("student", "student_id", "notes", "answers")
+    )
+    notes = ""
     if notes_path is not None:
         from px4fuse.report.notes import parse  # imported on demand, because it is slow
 
@@ -419,7 +413,8 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
             f"--answers {answers_path} was made for another log than {log.name}.",
             f"Give the form of {log.name}, or make one with px4fuse answers {log.name}.",
         )
-    student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
+    name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
+    student = Student(name, student_id, notes, answers)
     _warn_missing_fonts(student.name + student.id + student.notes)
     return student
 
@@ -431,8 +426,3 @@ def _warn_missing_fonts(text: str) -> None:
 
     if characters := missing_characters(text):
         click.echo(f"px4fuse: {font_advice(characters)}", err=True)
-
-
-def replace_unencodable(text: str) -> str:
-    """Replace bytes of a command line that are not valid UTF-8 by question marks."""
-    return text.encode(errors="replace").decode()

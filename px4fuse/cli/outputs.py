@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,7 +21,6 @@ from px4fuse.core.writing import STANDARD_OUTPUT, format_written_outputs, write_
 from px4fuse.errors import OutputError, ResultsError, to_one_line
 
 if TYPE_CHECKING:
-    from msgspec import Struct
     from rich.console import Console
 
     from px4fuse.report.page import Page
@@ -49,6 +48,11 @@ OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
+# Function that receives the current activity of a run and, if known, the counts of finished and all
+# items
+ShowProgress = Callable[..., None]
+
+
 class Interrupted(Exception):  # noqa: N818 - no error, because the user ends the run
     """End of a run by Ctrl-C or a termination signal, with a sentence on the written files."""
 
@@ -58,24 +62,18 @@ class Interrupted(Exception):  # noqa: N818 - no error, because the user ends th
         self.exit_code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-class ShowProgress(Protocol):
-    """Function that shows the current activity of a run, and the count of finished items."""
-
-    def __call__(
-        self, activity: str, done_count: int = 0, total_count: int | None = None
-    ) -> None: ...
-
-
-def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-    """Ignore the progress of a run."""
-
-
 @contextmanager
-def progress(output: Path | None = None) -> Iterator[ShowProgress]:
-    """Provide a function that shows the progress on a terminal.
+def progress(*targets: Path | None) -> Iterator[ShowProgress]:
+    """Check the output paths, and provide a function that shows the progress on a terminal.
 
-    In a pipe, or if ``output`` is standard output, the function shows nothing.
+    In a pipe, or if a target is standard output, the function shows nothing.
+
+    Raises
+    ------
+    OutputError
+        A target is not possible, see :func:`check_targets`.
     """
+    check_targets(targets)
     context = click.get_current_context(silent=True)
     if context and (send := context.meta.get(SEND_KEY)):
         yield lambda activity, *_: send(activity)
@@ -84,8 +82,8 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
     console = Console(stderr=True)
     # even a disabled progress bar prints an empty line in older versions of rich
-    if not console.is_terminal or output == STANDARD_OUTPUT:
-        yield show_nothing
+    if not console.is_terminal or STANDARD_OUTPUT in targets:
+        yield lambda *_: None
         return
     from rich import progress as rich_progress
 
@@ -109,8 +107,8 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
         yield show
 
 
-def default_report(stem: str, settings: str, results: Results) -> Path:
-    """Return the default path of a report: name of the log, and settings that are not defaults.
+def default_report(name: str, results: Results) -> Path:
+    """Return the default path of a report; a long name is cut.
 
     Raises
     ------
@@ -120,15 +118,13 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
 
-    name = f"{stem}{settings}"
     if len(os.fsencode(name)) > MAX_NAME_BYTES:
         short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     fault = "the file is not a report of this px4fuse version on the same input files and student"
-    _check_default(path, fault, partial(_is_same_report, results, read_attached_results))
-    json_path = path.with_suffix(".json")
-    _check_default(json_path, fault, partial(_is_same_report, results, read_results))
+    for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
+        _check_default(target, fault, partial(_is_same_report, results, read))
     return path
 
 
@@ -212,23 +208,26 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
 
 
 def result_files(
-    results: Struct | dict[str, Any],
+    results: Any,
     json_path: Path | None,
     output: Path | None = None,
     analysis: object = None,
-    show_progress: ShowProgress = show_nothing,
+    show_progress: ShowProgress = lambda *_: None,
+    default_name: str = "",
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by their paths.
 
-    Without ``analysis``, no report is made.
+    Without --json and -o, the report has the ``default_name``; without this name, none is made.
     """
     from px4fuse.results.contract import to_json
 
+    if default_name and output is None and json_path is None:
+        output = default_report(default_name, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
         json_path = None if json_path == STANDARD_OUTPUT else json_path
-    if output is not None and analysis is not None:
+    if output is not None:
         from px4fuse.report.pdf import render
 
         show_progress("writing the report")

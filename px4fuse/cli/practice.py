@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import output_option
+from px4fuse.cli.options import count_option, output_option
 from px4fuse.cli.outputs import (
     OPENS_OUTPUT_KEY,
     check_default_page,
@@ -17,27 +17,21 @@ from px4fuse.cli.outputs import (
 
 
 @click.command()
-@click.option(
+@count_option(
     "--seed",
-    type=click.IntRange(0, 2**32 - 1),
-    metavar="N",
+    0,
+    2**32 - 1,
     help="Seed of the random numbers: the same N gives the same flights.  [default: random]",
 )
-@click.option(
+@count_option(
     "--level",
-    type=click.IntRange(1, 3),
-    metavar="N",
+    1,
+    3,
     default=1,
     help="Difficulty of the flights. 1: one large fault; 2: one smaller fault; 3: one or two "
     "small faults.",
 )
-@click.option(
-    "--flights",
-    type=click.IntRange(1, 20),
-    metavar="N",
-    default=10,
-    help="Number of simulated flights on the page.",
-)
+@count_option("--flights", 1, 20, default=10, help="Number of simulated flights on the page.")
 @output_option("FILE.html", "Web page to write.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open",

@@ -1,12 +1,9 @@
 """Command ``px4fuse simulate``: simulates flights with ground truth and injected faults."""
 
-from __future__ import annotations
-
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args
+from typing import Any, get_args
 
 import click
 
@@ -14,6 +11,7 @@ from px4fuse.cli.options import (
     Choice,
     NonEmptyPath,
     TypedQuantity,
+    flag,
     input_option,
     output_option,
     typed_parameters,
@@ -21,13 +19,8 @@ from px4fuse.cli.options import (
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
-from px4fuse.errors import OutputError, SettingsError, to_one_line
-from px4fuse.simulation.mistakes import (
-    MISTAKES,
-    active_mistake_names,
-    format_mistake,
-    parse_mistakes,
-)
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
     Scenario,
@@ -37,15 +30,9 @@ from px4fuse.simulation.scenario import (
     make_scenario,
 )
 
-if TYPE_CHECKING:
-    from px4fuse.classroom.assignment.random_assignment import FlightKind
-    from px4fuse.report.page import Page
-    from px4fuse.simulation.flights import Simulation
-
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
-SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
 # Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
 # All options that can be combined with --assignment
@@ -58,18 +45,15 @@ ASSIGNMENT_OPTIONS = (
     *ASSIGNMENT_ONLY_OPTIONS,
 )
 MAX_SECRET_BYTES = 10_000
-Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def _scenario_options(command: Command) -> Command:
+def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add an option for each number of a scenario, with default and help of the field."""
     for field, quantity in reversed(bounds_by_field(Scenario).items()):
         if not quantity.meaning:
             continue
-        default, outdoors = (
-            getattr(_DEFAULT_SCENARIO, field),
-            DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field),
-        )
+        default = getattr(_DEFAULT_SCENARIO, field)
+        outdoors = DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field)
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
@@ -145,8 +129,8 @@ class CommandWithFaultTable(click.Command):
     help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
     "students.  [default with --assignment: DIR_answers.json]",
 )
-@click.option("--no-truth", is_flag=True, help="Write no ground truth to the log.")
-@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2, to save time.")
+@flag("--no-truth", help="Write no ground truth to the log.")
+@flag("--no-ekf2", help="Do not simulate EKF2, to save time.")
 @click.option(
     "--passes",
     type=int,
@@ -171,10 +155,7 @@ def simulate(
     answer: Path | None,
     no_truth: bool,
     no_ekf2: bool,
-    kind: Literal[ScenarioKind, "mixed"],
-    seed: int,
-    passes: int | None,
-    yaw: YawMode | None,
+    kind: Any,
     **option_values: Any,
 ) -> None:
     """Simulate a flight with ground truth and injected faults.
@@ -190,8 +171,8 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        random_choices = _read_secret(secret_file), cast("FlightKind", kind), mistakes
-        _write_assignment(assignment, output, answer, *random_choices, truth=not no_truth)
+        secret = _read_secret(secret_file)
+        _write_assignment(assignment, output, answer, secret, kind, mistakes, not no_truth)
         return
     if kind == MIXED_KIND:
         raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
@@ -199,15 +180,14 @@ def simulate(
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
     mistake_sizes = parse_mistakes(mistake)
-    option_values |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = make_scenario(
-        cast(ScenarioKind, kind),
+        kind,
         truth=not no_truth,
         ekf2=not no_ekf2,
         **{name: value for name, value in option_values.items() if value is not None},
     )
     from px4fuse.results.contract import to_json
-    from px4fuse.simulation import flights
+    from px4fuse.simulation import flights, terminal
 
     with progress() as show_progress:
         show_progress("simulating")
@@ -216,7 +196,7 @@ def simulate(
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
-    write_and_print(contents, _simulation_page(simulation, answer))
+    write_and_print(contents, terminal.summary(simulation, answer))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -258,21 +238,16 @@ def _write_assignment(
     folder: Path,
     answer_path: Path | None,
     secret: bytes | None,
-    kind: FlightKind,
+    kind: Any,
     count: int | None,
-    *,
     truth: bool,
 ) -> None:
     """Write one flight per student and the answer key."""
     from px4fuse.classroom.assignment import assignment
-    from px4fuse.classroom.assignment.random_assignment import (
-        EASIEST_DIFFICULTY,
-        HARDEST_DIFFICULTY,
-    )
     from px4fuse.classroom.assignment.roster import read_roster
-    from px4fuse.report.page import Page
+    from px4fuse.classroom.terminal import assignment_page
 
-    students, page = read_roster(roster), Page()
+    students = read_roster(roster)
     key_file = assignment.key_path(folder, answer_path)
     check_targets([key_file])
     check_output_folder(folder)
@@ -281,61 +256,4 @@ def _write_assignment(
         key, written_files = assignment.assign(
             students, folder, key_file, secret, kind, count, truth, show_flight
         )
-    counts = Counter(
-        mistake.partition("=")[0]
-        for answer in key.answers
-        for mistake in answer.mistakes or ("none",)
-    )
-    difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
-    folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
-    flight_count = len(key.answers)
-    texts = {
-        "Class": f"{flight_count} student{'s' * (flight_count != 1)}, {kind}",
-        "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-        "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {HARDEST_DIFFICULTY:g}. The difficulty is the smallest "
-        "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
-        "Flights": f"{folder_text} ({written_files} logs written, {flight_count - written_files} "
-        "existed already)",
-        "Answers": f"{key_text} (not for students: the file lists the injected faults)",
-    }
-    if key.secret:
-        texts["Secret"] = (
-            "a new secret is stored in the answer key. Use --secret-file to write the same "
-            "flights again, or to add students."
-        )
-    page.write_labelled_texts(texts)
-    write_and_print({}, page)
-
-
-def _simulation_page(simulation: Simulation, answer: Path | None) -> Page:
-    from px4fuse.report.page import Page
-
-    scenario, page = simulation.scenario, Page()
-    has_several = scenario.passes > 1
-    path = f"{scenario.passes} lap{'s' * has_several} of a square of {scenario.length_m:g} m"
-    if scenario.kind == "aisle":
-        path = f"{scenario.passes} pass{'es' * has_several} of {scenario.length_m:g} m"
-    texts = {
-        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-        "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
-        f"{scenario.source_rate_hz:g} Hz",
-    }
-    if scenario.kind == "loop":
-        texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the path"
-    texts["IMU"] = f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
-    page.write_labelled_texts(texts)
-    mistake_texts = [
-        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}"
-        for name in active_mistake_names(simulation.mistakes)
-    ]
-    page.write_labelled("Faults", *(mistake_texts or ["none"]))
-    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    ekf2_text = "EKF2 is not simulated (--no-ekf2)"
-    if scenario.ekf2:
-        ekf2_text = "EKF2 data are from px4fuse's model of EKF2"
-    page.write_labelled("EKF2", ekf2_text)
-    if answer is not None:
-        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
-    return page
+    write_and_print({}, assignment_page(key, folder, key_file, written_files))

@@ -5,12 +5,12 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
+from px4fuse.cli.options import analysis_options, comparison_request, json_option, log_argument
+from px4fuse.cli.outputs import progress, result_files, write_and_print
 
 
 @click.command()
-@click.argument("log", type=InputPath())
+@log_argument
 @analysis_options
 @json_option
 def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
@@ -29,7 +29,6 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, option_values)
-    check_targets([json_path])
     with progress(json_path) as show_progress:
         comparison = prepare_comparison(request, show_progress)
         _, clock_result = estimate_noises_and_clock(comparison, show_progress)

@@ -1,13 +1,8 @@
 """Command ``px4fuse verify``: repeats the analysis of a report, compares numbers and pages."""
 
-from __future__ import annotations
-
-import hashlib
 import sys
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -16,11 +11,6 @@ from px4fuse.cli.outputs import check_targets, progress, result_files, write_and
 from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited
 from px4fuse.errors import LogError
 
-if TYPE_CHECKING:
-    from px4fuse.report.page import Page
-    from px4fuse.verification.model import Verification
-
-SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 # Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
 TIMEOUT_S = 1800.0
 
@@ -45,6 +35,7 @@ def verify(
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
     from px4fuse.core.workers import JobFailure, run_one_with_limits
+    from px4fuse.verification.output import verdict_data, verdict_page
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
@@ -65,48 +56,6 @@ def verify(
     if isinstance(verdict, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
     report_files = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
-    contents = report_files | result_files(_verdict_data(content, verdict), json_path)
-    write_and_print(contents, _verification_page(display_name(report), verdict, output))
+    contents = report_files | result_files(verdict_data(content, verdict), json_path)
+    write_and_print(contents, verdict_page(display_name(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
-
-
-def _verdict_data(pdf: bytes, verdict: Verification) -> dict[str, object]:
-    from px4fuse.verification.verification import LIMIT_NOTE
-
-    values = asdict(verdict)
-    for name in ("redrawn", "remedy", "missing"):  # only px4fuse grade uses these fields
-        del values[name]
-    return {
-        "schema": SCHEMA,
-        "report_sha256": hashlib.sha256(pdf).hexdigest(),
-        "outcome": verdict.outcome,
-        **values,
-        "limit": LIMIT_NOTE,
-    }
-
-
-def _verification_page(name: str, verdict: Verification, output: Path | None) -> Page:
-    from px4fuse.core.text import one_line
-    from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-    from px4fuse.verification.verification import LIMIT_NOTE
-
-    page = Page()
-    colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
-    colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
-    page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
-    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT_NOTE]
-    sentences += [
-        f"{difference.path}: report {difference.recorded}, re-computed {difference.recomputed}"
-        for difference in verdict.differences
-    ]
-    for sentence in sentences:
-        page.write(sentence, indent=12.0)
-    if output is not None and not verdict.redrawn:
-        page.write("No report was written with -o, because the analysis was not repeated.")
-    elif output is None and verdict.pages:
-        page.write(
-            "Action: write the report again from the log with -o FILE.pdf, and read that report."
-        )
-    page.write(LIMIT_NOTE, colour=MUTED_COLOUR)
-    return page

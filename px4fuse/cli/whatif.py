@@ -1,22 +1,18 @@
 """Command ``px4fuse whatif``: replays EKF2 with changed parameters."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
-
-if TYPE_CHECKING:
-    from px4fuse.request import Sweep
+from px4fuse.request import Sweep, WhatIfRequest
 
 
 @click.command()
-@click.argument("log", type=options.InputPath())
+@options.log_argument
 @click.option(
     "--set",
     "changes",
@@ -69,10 +65,8 @@ def whatif(
     """
     from px4fuse.diagnose import run_what_if
     from px4fuse.report.whatif import summary
-    from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
 
-    outputs.check_targets([json_path])
     if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(
@@ -103,8 +97,6 @@ def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
 
 
 def _parse_sweep(text: str) -> Sweep:
-    from px4fuse.request import Sweep
-
     name, _, range_text = text.partition("=")
     limits = range_text.split(":")
     if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
@@ -122,8 +114,8 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
     try:
         return float(value)
     except ValueError as error:
+        expected_text = ""
         unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
-        number = convert_to_unit(value, unit)
-        unit_text = f" in {UNIT_NAMES[unit]}" if unit else ""
-        expected_text = "" if number is None else f"{unit_text}. Give {number:g}"
+        if unit and (number := convert_to_unit(value, unit)) is not None:
+            expected_text = f" in {UNIT_NAMES.get(unit, unit)}. Give {number:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{expected_text}.") from error

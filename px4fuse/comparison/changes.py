@@ -26,8 +26,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
-from px4fuse.flight.log import LogInfo
-from px4fuse.flight.model import Unavailable
+from px4fuse.flight.model import LogInfo, Unavailable
 
 # Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
 MIN_RERUN_SIGMA_Z_M = 0.005

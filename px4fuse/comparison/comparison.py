@@ -16,6 +16,7 @@ from px4fuse.comparison.model import (
     ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
+    PreparedComparison,
     UntestedFilter,
     Updates,
 )
@@ -31,14 +32,14 @@ Frame = pd.DataFrame | Unavailable
 
 
 def run_kf(
-    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
+    prepared: PreparedComparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
     """Run KF along each axis of a comparison, and return the runs by axis name."""
-    progress(f"running KF along the axes {', '.join(line.name for line in prepared.lines)}")
-    return {line.name: replay(line, prepared.settings) for line in prepared.lines}
+    progress(f"running KF along the axes {', '.join(axis.name for axis in prepared.input_axes)}")
+    return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
 
 
-def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
+def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
     """Add the results along each axis: KF against EKF2, and both against ground truth."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
@@ -56,10 +57,13 @@ def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
     horizontal = {
         name: nis for name, frames in innovations.items() if (nis := _horizontal_nis(frames))
     }
-    return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
+    inputs = replace(prepared, notes=tuple(notes))
+    return Comparison(**vars(inputs), axes=axes, horizontal=horizontal)
 
 
-def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
+def _compare_axis(
+    prepared: PreparedComparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
+) -> AxisComparison:
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()

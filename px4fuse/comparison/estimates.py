@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import structs
 from scipy.special import stdtr
 
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.noise_differences import NoisyPart, find_noisy_part, tune_by_axis
 from px4fuse.core.arrays import Array
 from px4fuse.filter.correlated_noise import (
@@ -32,8 +32,7 @@ from px4fuse.filter.time_offset import (
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
-from px4fuse.flight.model import Flight, Unavailable, reset_times_s
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
@@ -102,7 +101,9 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
     """Estimate noises, time offset, yaw misalignment and errors of the source."""
     tuned_axes = (
-        REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
+        REPORTED_AXES
+        if {"north", "east"} <= {axis.name for axis in comparison.input_axes}
+        else None
     )
     tuning, clock_offset = estimate_noises_and_clock(comparison, progress, tuned_axes)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock_offset)
@@ -120,7 +121,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
 
 
 def tuned(
-    comparison: Comparison,
+    comparison: PreparedComparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
@@ -141,7 +142,7 @@ def tuned(
     if flight.log.is_assessed:
         return {HORIZONTAL: DIAGNOSIS_WITHHELD}
     return tune(
-        comparison.lines,
+        comparison.input_axes,
         comparison.settings,
         names,
         lambda name: progress(f"tuning {name}"),
@@ -152,7 +153,7 @@ def tuned(
 
 
 def estimate_noises_and_clock(
-    comparison: Comparison,
+    comparison: PreparedComparison,
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:

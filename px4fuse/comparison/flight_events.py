@@ -64,7 +64,7 @@ def collect_events(comparison: Comparison) -> Events:
     """Collect gaps, rejections and resets of a flight."""
     flight, segment = comparison.flight, comparison.segment.flight
     start_s, end_s = segment.start_s, segment.end_s
-    time_s = np.concatenate([[start_s], comparison.lines[0].measurement_time_s, [end_s]])
+    time_s = np.concatenate([[start_s], comparison.input_axes[0].measurement_time_s, [end_s]])
 
     airborne = airborne_spans(flight)
     flight_edges_s = [start_s, *(edge_s for span in airborne for edge_s in span), end_s]

@@ -1,14 +1,13 @@
 """Records of a comparison: inputs, results along each axis, and the tracks of both filters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import (
     NOT_WRITTEN,
     Count,
@@ -21,6 +20,7 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
     Vector,
+    one_line_repr,
 )
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
@@ -34,7 +34,7 @@ Track: TypeAlias = pd.DataFrame | Unavailable
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
-class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
+class ErrorsAgainstTruth(Record, kw_only=True):
     """Errors of one filter against ground truth, at the times of EKF2's published state.
 
     The mean NEES (expected 1) is None without a reported variance. It has no chi-square band,
@@ -55,7 +55,7 @@ class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
         return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"
 
 
-class FilterSummary(Consistency, frozen=True, kw_only=True):
+class FilterSummary(Consistency, kw_only=True):
     """Consistency of one filter along one axis, its reported σ and its errors.
 
     Attributes
@@ -74,7 +74,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class UntestedFilter(Unavailable, frozen=True, kw_only=True):
+class UntestedFilter(Unavailable, kw_only=True):
     """Reason why a filter was not tested for consistency, with its reported σ and errors."""
 
     sigma_p_median_m: Positive | None = None
@@ -84,7 +84,7 @@ class UntestedFilter(Unavailable, frozen=True, kw_only=True):
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class Difference(Record, frozen=True, kw_only=True):
+class Difference(Record, kw_only=True):
     """Difference KF - EKF2 along one axis, at EKF2's sample times."""
 
     count: Count
@@ -96,7 +96,7 @@ class Difference(Record, frozen=True, kw_only=True):
     velocity_maximum_m_s: NotNegative
 
 
-class Updates(Record, frozen=True, kw_only=True):
+class Updates(Record, kw_only=True):
     """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
 
     count: Count
@@ -106,7 +106,7 @@ class Updates(Record, frozen=True, kw_only=True):
     input_gap_s: NotNegative
 
 
-class AxisComparison(Record, frozen=True, kw_only=True):
+class AxisComparison(Record, kw_only=True):
     """Result of the comparison along one axis, with the KF run and the tracks.
 
     Attributes
@@ -150,21 +150,17 @@ class AxisComparison(Record, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Inputs of a comparison and, after the filters ran, the results along each axis.
+class PreparedComparison:
+    """Inputs of a comparison, before KF runs.
 
     Attributes
     ----------
     settings : Settings
         Settings of KF; ``input`` is "zero" if the log has no acceleration.
-    lines : tuple of Axis
+    input_axes : tuple of Axis
         Axes with their measurements and accelerations, the inputs of KF.
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
-    axes : mapping from axis name to AxisComparison
-        Empty before the filters run.
-    horizontal : mapping from "kf" and "ekf2" to HorizontalNis
-        NIS of north and east together, if both were analysed.
     convention : Convention or None
         Axes, unit and clock with which the source was sent; ``source`` is already converted.
     """
@@ -174,14 +170,27 @@ class Comparison:
     source_reason: str
     segment: Segment
     settings: Settings
-    lines: tuple[Axis, ...]
+    input_axes: tuple[Axis, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
-    axes: Mapping[str, AxisComparison] = field(default_factory=dict)
-    horizontal: Mapping[FilterName, HorizontalNis] = field(default_factory=dict)
-    convention: Convention | None = None
+    convention: Convention | None
 
     __repr__ = one_line_repr
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison(PreparedComparison):
+    """Results of a comparison along each axis, with its inputs.
+
+    Attributes
+    ----------
+    axes : mapping from axis name to AxisComparison
+    horizontal : mapping from "kf" and "ekf2" to HorizontalNis
+        NIS of north and east together, if both were analysed.
+    """
+
+    axes: Mapping[str, AxisComparison]
+    horizontal: Mapping[FilterName, HorizontalNis]
 
     def __getitem__(self, axis: str) -> AxisComparison:
         """Return the comparison along an axis, by its name.

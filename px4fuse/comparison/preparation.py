@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convention_faults, correct_convention
@@ -17,6 +17,7 @@ from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segm
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
+    POSITION_FILE,
     Columns,
     Ekf2,
     Flight,
@@ -25,7 +26,6 @@ from px4fuse.flight.model import (
     Unavailable,
     join_flights,
 )
-from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
@@ -49,7 +49,9 @@ NO_SEPARATE_TRUTH = Unavailable(
 GNSS_AXES = (AISLE, "north", "east")
 
 
-def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
+def prepare(
+    flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
+) -> PreparedComparison:
     """Choose position source, segment and axes of a flight.
 
     With ``as_sent``, axes, unit and clock of the source are neither checked nor corrected.
@@ -112,7 +114,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         settings = replace(settings, input="zero")
         notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
-    return Comparison(
+    return PreparedComparison(
         flight,
         source_track,
         source_reason,
@@ -121,7 +123,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
         compared_axes,
         notes,
         missing,
-        convention=convention,
+        convention,
     )
 
 

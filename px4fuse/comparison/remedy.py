@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.replay import inside_spans
+from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, Noise
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS, Aid
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
 # Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
@@ -36,14 +36,14 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
         return None
     nis_sums = []
     for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
-        updates = replay.updates[
-            inside_spans(replay.updates.index, model.baseline_replay.evaluated_s)
+        update_tables = [
+            rows_inside(updates, model.baseline_replay.evaluated_s)
+            for updates in (replay.updates, replay.other_aid_updates[GNSS_VEL.name])
         ]
         nis = [
-            updates[f"innovation_{axis}_{unit}"] ** 2
-            / updates[f"innovation_variance_{axis}_{variance_unit}"]
+            updates[f"innovation_{axis}_m"] ** 2 / updates[f"innovation_variance_{axis}_m2"]
             for axis in ("north", "east")
-            for unit, variance_unit in (("m", "m2"), ("m_s", "m2_s2"))
+            for updates in update_tables
         ]
         # mean NIS times a fixed number: the number of evaluated samples depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
@@ -112,7 +112,7 @@ def ml_delay_change(
 
 
 def wrong_delay_ms(
-    comparison: Comparison, clock_offset: ClockOffset, logged_delay_ms: float
+    comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
     ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
@@ -128,12 +128,12 @@ def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float)
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
 
 
-def aid_of(comparison: Comparison, axis: str = "") -> Aid:
+def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
     """Return EKF2's aiding source for the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
-def delay_ms(comparison: Comparison) -> float | None:
+def delay_ms(comparison: PreparedComparison) -> float | None:
     """Return the delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
     None if the parameter is not logged or EKF2 does not use it.

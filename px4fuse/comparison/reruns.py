@@ -53,7 +53,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
-from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
+from px4fuse.ekf2.replay import Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -70,6 +70,8 @@ from px4fuse.flight.model import Columns, Unavailable
 
 # Maximum mean NIS of innovations without visible errors
 MAX_NORMAL_NIS = 1.5
+INNOVATIONS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
+INNOVATION_VARIANCES = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
@@ -266,8 +268,8 @@ def _unchanged_statistics(
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
     compared_s = tested_filter.model.baseline_replay.evaluated_s
-    compared_state = logged_state[inside_spans(logged_state.index, compared_s)]
-    innovations = innovations[inside_spans(innovations.index, compared_s)]
+    compared_state = rows_inside(logged_state, compared_s)
+    innovations = rows_inside(innovations, compared_s)
     rejected_flags = innovations["rejected"].dropna()
     logged_statistics = _run_statistics(
         innovations["innovation_m"].to_numpy(),
@@ -405,8 +407,8 @@ def _replay_statistics(
         # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
-    ekf2_updates = ekf2_updates[inside_spans(ekf2_updates.index, compared_s)]
-    innovation_variance_m2 = weighted_sum(ekf2_updates, UPDATE_COLUMNS[2:4], direction_cosines**2)
+    ekf2_updates = rows_inside(ekf2_updates, compared_s)
+    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCES, direction_cosines**2)
     prior_m2 = innovation_variance_m2 - weighted_sum(
         ekf2_updates, OBSERVATION_VARIANCES, direction_cosines**2
     )
@@ -419,12 +421,12 @@ def _replay_statistics(
         index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
     )
     published = project(ekf2_replay.published, axis, comparison.segment)
-    published = published[inside_spans(published.index, compared_s)]
+    published = rows_inside(published, compared_s)
     logged_state, compared_track = axis_result.ekf2_state, published
     if not change and not isinstance(logged_state, Unavailable):
-        compared_track = logged_state[inside_spans(logged_state.index, compared_s)]
+        compared_track = rows_inside(logged_state, compared_s)
     return _run_statistics(
-        weighted_sum(ekf2_updates, UPDATE_COLUMNS[:2], direction_cosines),
+        weighted_sum(ekf2_updates, INNOVATIONS, direction_cosines),
         innovation_variance_m2,
         error_statistics(published, variance_by_time, axis_result.truth),
         difference(axis_result.replay, compared_track),

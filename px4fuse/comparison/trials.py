@@ -43,7 +43,7 @@ POSITION_IMPROVEMENT = 0.20
 MAX_REMAINING_ERROR_FRACTION = 0.75
 
 
-class RunStatistics(Record, frozen=True, kw_only=True):
+class RunStatistics(Record, kw_only=True):
     """Statistics of one run of a filter along one axis; RMSE and NEES are against ground truth."""
 
     innovations: Count = 0
@@ -61,7 +61,7 @@ class RunStatistics(Record, frozen=True, kw_only=True):
         }[statistic]
 
 
-class Trial(Record, frozen=True, kw_only=True):
+class Trial(Record, kw_only=True):
     """Re-run of one filter along one axis with a change, and its effect.
 
     Attributes

@@ -13,7 +13,7 @@ Order = Literal["w x y z", "x y z w"]
 Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
 
-class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=False):
+class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     """Order and frames of the orientation of a position source.
 
     Attributes
@@ -37,7 +37,7 @@ class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=Fal
     tilt_difference_deg: NotNegative = 0.0
 
 
-class Convention(Record, frozen=True, kw_only=True):
+class Convention(Record, kw_only=True):
     """Axes, unit and clock of the positions of a source, as sent.
 
     Attributes

@@ -1,4 +1,4 @@
-"""Base class of the records in results, and :class:`Unavailable` for missing data.
+"""Base class of the records in results, their display, and :class:`Unavailable` for missing data.
 
 Field names contain the unit.
 """
@@ -7,13 +7,54 @@ from __future__ import annotations
 
 from abc import ABCMeta
 from collections.abc import Mapping
+from functools import singledispatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union, dataclass_transform
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, UnsetType
 
-from px4fuse.core.notebook_display import one_line_repr
+# Maximum length (characters) of a text field in the representation of a record
+MAX_TEXT_LENGTH = 60
+
+
+@singledispatch
+def display_html(result: object) -> str | None:
+    """Return a result as HTML for notebooks; None for types without a registered function."""
+    return None
+
+
+def one_line_repr(result: Any) -> str:
+    """Format a record on one line, with the shapes of tables and arrays instead of their values.
+
+    >>> import pandas as pd
+    >>> from px4fuse.flight.model import Truth
+    >>> one_line_repr(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
+    "Truth(name='mocap', samples=<2 × 1>)"
+    """
+    field_names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
+    values = ((name, getattr(result, name)) for name in field_names)
+    field_texts = ", ".join(
+        f"{name}={_format_value(value)}"
+        for name, value in values
+        if not isinstance(value, UnsetType | None)
+    )
+    return f"{type(result).__name__}({field_texts})"
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str):
+        return repr(
+            value if len(value) <= MAX_TEXT_LENGTH else f"{value[: MAX_TEXT_LENGTH - 3]}..."
+        )
+    if shape := getattr(value, "shape", ()):
+        return f"<{' × '.join(f'{length:,}' for length in shape)}>"
+    if isinstance(value, int):
+        return repr(value)
+    return f"<{len(value):,}>" if isinstance(value, Mapping | tuple) else type(value).__name__
+
 
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -29,6 +70,7 @@ Vector = tuple[float, float, float]
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
+@dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Immutable record; fields that are None are not written to the results.
 
@@ -39,7 +81,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
     __repr__ = one_line_repr
 
 
-class Unavailable(Record, frozen=True):
+class Unavailable(Record):
     """Missing data with reason and action, used in place of a record.
 
     Attributes
@@ -126,7 +168,7 @@ def to_serializable(value: Any) -> Any:
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
-def read_toml(module_file: str, name: str, kind: type[T]) -> T:
+def read_toml(module_file: str, kind: type[T], name: str = "") -> T:
     """Read a TOML file of px4fuse as the type ``kind``.
 
     Parameters
@@ -134,6 +176,7 @@ def read_toml(module_file: str, name: str, kind: type[T]) -> T:
     module_file : str
         ``__file__`` of a module in the same folder.
     name : str
-        Name of the TOML file.
+        Name of the TOML file; by default that of the module.
     """
-    return msgspec.toml.decode(Path(module_file).with_name(name).read_bytes(), type=kind)
+    path = Path(module_file).with_suffix(".toml")
+    return msgspec.toml.decode((path.with_name(name) if name else path).read_bytes(), type=kind)

@@ -4,7 +4,7 @@ import math
 import re
 import shlex
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -34,6 +34,19 @@ def to_json_types(value: object) -> Any:
     if value is msgspec.UNSET or (isinstance(value, float) and not math.isfinite(value)):
         return None
     return value
+
+
+def convert_nested(value: Any, convert: Callable[[Any], Any]) -> Any:
+    """Convert the keys and elements of nested dicts, lists and tuples.
+
+    >>> convert_nested({"a": ["b", 1]}, lambda element: f"<{element}>")
+    {'<a>': ['<b>', '<1>']}
+    """
+    if isinstance(value, dict):
+        return {convert(key): convert_nested(child, convert) for key, child in value.items()}
+    if isinstance(value, list | tuple):
+        return [convert_nested(child, convert) for child in value]
+    return convert(value)
 
 
 def utc_time(unix_s: float | None) -> str | None:
@@ -137,6 +150,11 @@ def format_metres(length_m: float) -> str:
     """
     decimals = sum(abs(length_m) < limit for limit in (99.95, 9.995, 0.0995))
     return f"{length_m:.{decimals}f}"
+
+
+def replace_unencodable(text: str) -> str:
+    """Replace bytes of a path or command line that are not valid UTF-8 by question marks."""
+    return text.encode(errors="replace").decode()
 
 
 def with_log_name(text: str, log_name: str) -> str:

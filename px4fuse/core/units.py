@@ -2,15 +2,16 @@
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from px4fuse.core.record import read_toml
 
-_UNITS = read_toml(__file__, "units.toml", dict[str, dict[str, Any]])
+_UNITS = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNITS["names"]
-# Factors that convert typed units to a unit of px4fuse, by the unit of px4fuse
-_SCALES_BY_UNIT: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
+# Ratio of each unit (lower case) to one unit of the same quantity, by quantity
+_RATIOS: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
@@ -23,10 +24,10 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     (0.1, 0.5, None)
     """
     match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
-    scale = _SCALES_BY_UNIT.get(unit, {}).get(match[2].lower() or unit.lower()) if match else None
-    if match is None or scale is None:
-        return None
-    try:
-        return float(match[1].replace(",", ".")) * scale
-    except ValueError:  # the text contains several decimal points
-        return None
+    unit = unit.lower()
+    typed_unit = match[2].lower() or unit if match else ""
+    for ratios in ({unit: 1.0}, *_RATIOS.values()):
+        if match and {typed_unit, unit} <= ratios.keys():
+            with suppress(ValueError):  # the text contains several decimal points
+                return float(match[1].replace(",", ".")) * (ratios[typed_unit] / ratios[unit])
+    return None

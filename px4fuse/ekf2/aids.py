@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray, median_interval
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
@@ -55,7 +55,7 @@ MIN_HEIGHT_M = 2.0
 HEIGHT_MEDIAN_SAMPLES = 11
 
 
-class AidAxis(Record, frozen=True, kw_only=True):
+class AidAxis(Record, kw_only=True):
     """Innovation statistics of one aiding source along one axis, in the unit of its measurements.
 
     Attributes
@@ -88,7 +88,7 @@ class AidAxis(Record, frozen=True, kw_only=True):
         return self.innovation_mean / self.s_sqrt_median
 
 
-class AidResult(Record, frozen=True, kw_only=True):
+class AidResult(Record, kw_only=True):
     """Fusion and consistency of one aiding source of EKF2 in flight.
 
     Attributes
@@ -157,8 +157,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
         flying_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
         if len(flying_s):
-            start = float(flying_s[0])
-            end = float(flying_s[-1])
+            start, end = flying_s[[0, -1]].tolist()
     return start, end
 
 
@@ -188,33 +187,30 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     samples = aid_log.samples.loc[start_s:end_s]
     sample_s = samples.index.to_numpy()
     gate = _effective_gate(aid, aid_log)
-    innovation, innovation_variance = (
-        samples[[f"{quantity}_{axis}" for axis in aid_log.axes]].to_numpy()
-        for quantity in ("innovation", "variance")
-    )
+
+    def quantities(name: str) -> Array:
+        return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
+
+    innovation, innovation_variance = quantities("innovation"), quantities("variance")
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:
         is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
         flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
-        is_grid_enabled = np.asarray(step_values_at(aid_log.enabled, flight_grid_s) > 0.0)
-        enabled_fraction = _fraction_within(is_grid_enabled, np.ones(len(flight_grid_s), bool))
+        enabled_fraction = float(np.mean(step_values_at(aid_log.enabled, flight_grid_s) > 0.0))
     fused_logged = "fused" in samples
-    is_fused: BoolArray
-    is_rejected: BoolArray
+    is_reset = np.zeros(len(samples), bool)
+    noise_median = None
     if fused_logged:
-        is_fused, is_rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
-        noise_sigma = samples[[f"noise_{axis}" for axis in aid_log.axes]].to_numpy()
+        is_fused, is_rejected = samples[["fused", "rejected"]].to_numpy().T > 0.0
+        noise_sigma = quantities("noise")
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
-        noise_median = (
-            float(np.median(np.sqrt(noise_sigma[is_fused, 0]))) if is_fused.any() else None
-        )
+        if is_fused.any():
+            noise_median = float(np.median(np.sqrt(noise_sigma[is_fused, 0])))
     else:
         is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
-        is_reset = np.zeros(len(samples), bool)
-        noise_median = None
     is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
     longest_gap_s = _longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
     axes = {}
@@ -248,9 +244,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         unit=aid.unit,
         topic=aid_log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction_within(is_fused & is_enabled, is_enabled),
+        fused_fraction=_fraction_within(is_fused, is_enabled),
         fused_logged=fused_logged,
-        rejected_fraction=_fraction_within(is_rejected & is_enabled, is_enabled),
+        rejected_fraction=_fraction_within(is_rejected, is_enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
@@ -290,7 +286,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
 
 
 def _fraction_within(is_selected: BoolArray, is_in_set: BoolArray) -> float:
-    return float(is_selected.sum() / max(is_in_set.sum(), 1))
+    return float((is_selected & is_in_set).sum() / max(is_in_set.sum(), 1))
 
 
 def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
@@ -340,7 +336,7 @@ def _longest_gap(
 
 
 def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
-    interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
+    interval_s = median_interval(fused_s) if len(fused_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
         MAX_NOT_FUSED_S, MAX_NOT_FUSED_INTERVALS * interval_s
     ):

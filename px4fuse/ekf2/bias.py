@@ -27,11 +27,12 @@ TEST_RATIO_FILTER_S = 10.0
 class BiasEstimator:
     """Bias of one sensor along k axes in S filter configurations, updated with each sample.
 
-    ``value_m`` (added to innovations) and ``variance_m2`` have shape (S,) or (S, k); ``step_s`` is
-    EKF2's prediction step.
+    ``value_m`` (added to innovations) and ``variance_m2`` have shape (S,) or (S, k); ``steps_s``
+    are EKF2's prediction steps.
     """
 
-    def __init__(self, value_m: Array, variance_m2: Array, step_s: float) -> None:
+    def __init__(self, value_m: Array, variance_m2: Array, steps_s: Array) -> None:
+        step_s = np.median(steps_s)
         self.value_m = value_m
         self.variance_m2 = variance_m2
         self.mean_signed_ratio = np.zeros_like(value_m)

@@ -20,7 +20,6 @@ from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
-from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_GATE,
@@ -31,10 +30,11 @@ from px4fuse.ekf2.heights import (
 )
 from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
-from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
+from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, fuse_mean, mean_by_event
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
+    EARTH_FIELD,
     GRAVITY_M_S2,
     GYRO_BIAS,
     IMU_STATE_COUNT,
@@ -44,7 +44,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
 )
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
-from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance, to avoid a division by zero
 MIN_STATE_VARIANCE = 1e-30
@@ -128,13 +128,11 @@ class FilterConfiguration:
 
     def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
         """Return True if the logged flag for a bad acceleration is valid with these parameters."""
-        changed_parameters = {
-            name for name, value in self.settings.items() if value != inputs.settings[name]
-        }
-        has_same_heights = all(
-            name.startswith(HEIGHT_NEUTRAL_PREFIXES) for name in changed_parameters
+        has_same_heights = not self.without and all(
+            value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
+            for name, value in self.settings.items()
         )
-        return self.uses_logged_decisions or (has_same_heights and not self.without)
+        return self.uses_logged_decisions or has_same_heights
 
     def timing(self, inputs: Inputs) -> Timing:
         """Return the delay of a position, and the delay of the fusion horizon."""
@@ -225,17 +223,19 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         uses_logged_decisions,
         uses_reported_noise,
         fuses_velocity,
-    ) = (
-        np.array([getattr(configuration, name) for configuration in configurations])
-        for name in (
-            "estimates_biases",
-            "estimates_attitude",
-            "has_gate",
-            "uses_logged_decisions",
-            "uses_reported_noise",
-            "fuses_velocity",
-        )
-    )
+    ) = np.array(
+        [
+            (
+                configuration.estimates_biases,
+                configuration.estimates_attitude,
+                configuration.has_gate,
+                configuration.uses_logged_decisions,
+                configuration.uses_reported_noise,
+                configuration.fuses_velocity,
+            )
+            for configuration in configurations
+        ]
+    ).T
     distinct_intervals = list(dict.fromkeys(intervals))
     configuration_intervals = (
         list(map(distinct_intervals.index, intervals))
@@ -248,7 +248,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         return np.stack(arrays, axis=1)[:, configuration_intervals]
 
     event_table = stack_configurations("events")
-    action = np.where(has_gate, event_table["action"], np.where(event_table["usable"], FUSE, IDLE))
+    action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
     is_active = action > IDLE
     event_time_s = segment.time_s[event_steps]
@@ -265,7 +265,6 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     measured_values, measurement_variance = _measurements_by_event(
         inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
     )
-    is_sequential = inputs.aid == GNSS_POS
     has_velocity = inputs.received.velocity_m_s is not None
     gates = [
         parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
@@ -280,53 +279,39 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     logged_variance = np.stack(
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
-    field_samples = heights = flow_samples = vision = None
-    has_field, has_flow = np.zeros((2, event_count), bool)
-
-    def enabled_means(source_aid: Aid, samples: Sequence[EventSamples]) -> EventSamples:
-        stacked_fields = (
-            np.stack(axis_values, axis=1)[:, configuration_intervals]
-            for axis_values in zip(*samples, strict=True)
-        )
-        mean_samples = EventSamples(*stacked_fields)
-        return mean_samples._replace(
-            sample_count=np.where(
-                is_enabled_by_aid[source_aid.name], mean_samples.sample_count, 0.0
+    heights = vision = None
+    has_field = segment.field is not None
+    ends = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
+    vector_means = []
+    for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
+        if samples is not None:
+            means = [mean_by_event(segment, samples, end_steps) for end_steps in ends]
+            stacked_means = (
+                np.stack(quantities, axis=1)[:, configuration_intervals]
+                for quantities in zip(*means, strict=True)
             )
-        )
-
-    end_steps_by_intervals = [
-        interval_arrays.events.end_step for interval_arrays in distinct_intervals
+            mean = EventSamples(*stacked_means)
+            if aid == MAG:
+                R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
+                mean = mean._replace(noise=mean.noise + R)
+            sample_count = mean.sample_count * is_enabled_by_aid[aid.name]
+            gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
+            mean = mean._replace(sample_count=sample_count)
+            vector_means.append((mean, gate, samples.state_rows))
+    follows_log = [
+        segment.heights is None
+        or segment.is_acceleration_bad is None
+        or configuration.keeps_logged_bad_acceleration(inputs)
+        for configuration in configurations
     ]
-    if (field := segment.field) is not None:
-        field_samples = enabled_means(
-            MAG, [mean_by_event(field, end_steps) for end_steps in end_steps_by_intervals]
-        )
-        has_field = np.asarray(field_samples.sample_count.any(axis=1))
-    if (flow := segment.flow) is not None:
-        flow_samples = enabled_means(
-            FLOW,
-            [
-                mean_by_event(flow, end_steps, segment.imu_velocity_m_s)
-                for end_steps in end_steps_by_intervals
-            ],
-        )
-        has_flow = np.asarray(flow_samples.sample_count.any(axis=1))
-    has_logged_flag = segment.heights is None or segment.is_acceleration_bad is None
     bad_acceleration = BadAcceleration(
-        np.array(
-            [has_logged_flag or c.keeps_logged_bad_acceleration(inputs) for c in configurations]
-        ),
-        inputs.rules.bad_acceleration_s,
-        segment,
+        np.array(follows_log), inputs.rules.bad_acceleration_s, segment
     )
     if segment.heights is not None:
-        barometer_arrays = np.stack(barometer_samples(segment, end_steps_by_intervals), axis=-1)[
-            ..., configuration_intervals
-        ]
+        barometer = np.stack(barometer_samples(segment, ends), axis=-1)
         heights = HeightFilter(
             segment,
-            barometer_arrays,
+            barometer[..., configuration_intervals],
             event_table["time_s"],
             is_active,
             is_enabled_by_aid,
@@ -358,49 +343,46 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs, segment, parameters, has_biases, has_attitude
     )
     step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))[
-        :, :, None, None
-    ]
+    acceleration_variance = np.tile(
+        parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
+    )
     if (clipped_fraction := segment.clipped_fraction) is not None:
         # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
         clipped_fraction_sums = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
-        mean_clipped_fraction = (clipped_fraction_sums[:, :, None] / np.maximum(step_counts, 1))[
-            ..., None
-        ]
-        acceleration_variance += mean_clipped_fraction * (
-            BAD_ACCELERATION_NOISE**2 - acceleration_variance
+        acceleration_variance += (
+            clipped_fraction_sums[:, :, None, None]
+            / np.maximum(step_counts, 1)[..., None]
+            * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
         )
     x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
         # the log contains no bias estimate while EKF2 declared its acceleration bad: start with the
         # bias from the published velocity
-        has_bias = ~bad_acceleration.follows_log & has_biases
-        P[has_bias, BIAS_DOWN, :] = 0.0
-        P[has_bias, :, BIAS_DOWN] = 0.0
-        P[has_bias, BIAS_DOWN, BIAS_DOWN] = INITIAL_BIAS_SIGMA_M_S2**2
-        x[has_bias, BIAS_DOWN] = segment.mean_bias_down_m_s2
-    logged_decisions = inputs.received.rejected[sample_index], inputs.received.reset[sample_index]
+        set_states(
+            x,
+            P,
+            ~bad_acceleration.follows_log & has_biases,
+            slice(BIAS_DOWN, BIAS_DOWN + 1),
+            np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
+            np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
+        )
     is_aid_enabled = is_enabled_by_aid[inputs.aid.name]
-    action_inputs = (
+    fusion = _Fusion(
+        inputs.rules,
+        segment.time_s[0],
         np.where(is_aid_enabled, action, IDLE),
         event_table["can_start"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
-    )
-    fusion = _Fusion(
-        inputs.rules,
-        segment.time_s[0],
-        *action_inputs,
-        *logged_decisions,
+        inputs.received.rejected[sample_index],
+        inputs.received.reset[sample_index],
         inputs.received.has_all_resets,
     )
     innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
-    field_results = np.full(
-        (0 if field_samples is None else event_count, 3, configuration_count, 3), np.nan
-    )
+    field_results = np.full((event_count * has_field, 3, configuration_count, 3), np.nan)
     is_rejected, is_fused, is_reset = np.zeros((3, event_count, configuration_count), bool)
     position_reset_m = np.zeros((event_count, configuration_count, 2))
     states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
@@ -410,6 +392,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     measured_slice = slice(0 if has_velocity else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
+    reset_states = [(HORIZONTAL_POSITION, POSITION_COLUMNS, inputs.rules.reset_variance_factor)]
+    if has_velocity and inputs.rules.resets_velocity:
+        reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
@@ -448,15 +433,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
-        if field_samples is not None and has_field[e]:
-            field_now = EventSamples(*(axis_values[e] for axis_values in field_samples))
-            x, P, field_results[e] = fuse_field(
-                x, P, field_now, parameters[MAG.noise], parameters[MAG.gate]
-            )
-        if flow_samples is not None and flow is not None and has_flow[e]:
-            x, P = fuse_flow(
-                x, P, EventSamples(*(axis_values[e] for axis_values in flow_samples)), flow.gate
-            )
+        for mean, gate, state_rows in vector_means:
+            if mean.sample_count[e].any():
+                mean_now = EventSamples(*(quantity[e] for quantity in mean))
+                x, P, vector_results = fuse_mean(x, P, mean_now, gate, *state_rows)
+                if EARTH_FIELD in state_rows:
+                    field_results[e] = vector_results
         if vision is not None:
             x, P = vision.fuse(e, x, P, False, fusion.last_position_s)
         if heights is not None:
@@ -481,8 +463,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_rejected[e], is_fused[e], is_reset[e], is_velocity_fused = fusion.decide(
                 e, is_outside_gate, is_velocity_fused
             )
-            if is_sequential:
-                if field_samples is None:
+            if inputs.aid == GNSS_POS:
+                if not has_field:
                     # without logged magnetometer samples the correction of the tilt is unknown, so
                     # only the tilt variance is set to the logged value
                     for row in range(HEADING):
@@ -506,11 +488,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 e, x, P, measured_values[e, :, 5], measurement_variance[e, :, 5]
             )
         # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
-        elif field_samples is not None:
+        elif has_field:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
             x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = logged_values[e, :, 1]
-        if field_samples is None:
+        if not has_field:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
             R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
             heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
@@ -524,26 +506,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = _joint_update(x, P, innovation, R)
             x[:, HEADING] = heading
         if has_sample[e] and is_reset[e].any():
-            reset_variance = (
-                inputs.rules.reset_variance_factor * measurement_variance[e, :, POSITION_COLUMNS]
-            )
-            set_states(
-                x,
-                P,
-                is_reset[e],
-                HORIZONTAL_POSITION,
-                measured_values[e, :, POSITION_COLUMNS],
-                reset_variance,
-            )
-            if has_velocity and inputs.rules.resets_velocity:
-                set_states(
-                    x,
-                    P,
-                    is_reset[e],
-                    VELOCITY,
-                    measured_values[e, :, VELOCITY_COLUMNS],
-                    measurement_variance[e, :, VELOCITY_COLUMNS],
-                )
+            for rows, columns, factor in reset_states:
+                reset_variance = factor * measurement_variance[e, :, columns]
+                set_states(x, P, is_reset[e], rows, measured_values[e, :, columns], reset_variance)
             position_reset_m[e, is_reset[e]] = nu[is_reset[e], POSITION_COLUMNS]
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
@@ -805,9 +770,7 @@ def _start_state(
         (GYRO_BIAS, has_attitude),
         (ACCELEROMETER_BIAS, has_biases),
     ):
-        P[~is_estimated, :, rows] = 0.0
-        P[~is_estimated, rows, :] = 0.0
-        x[~is_estimated, rows] = 0.0
+        set_states(x, P, ~is_estimated, rows, *np.zeros((2, len(x), 3)))
     x[~has_biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
     return x, P
 

@@ -13,8 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array
-from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean
 from px4fuse.ekf2.replay_segments import VELOCITY, ReplaySegment, SensorSamples, low_pass_weights
 from px4fuse.flight.model import FLOW_FILTER_WEIGHT
 
@@ -39,9 +37,6 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
         sample_count,
         flow["noise_m2_s2"].to_numpy(),
         gate,
+        (VELOCITY,),
     )
     return replace(segment, flow=sensor_samples)
-
-
-def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:
-    return fuse_mean(x, P, flow_samples, flow_samples.noise, np.full(len(x), gate), VELOCITY)[:2]

@@ -148,10 +148,8 @@ def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
     fused_quantity = (
         "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
     )
-    reason, action = (
-        f"Bit {bit} ({fused_quantity}) of {parameter_name} is not set.",
-        f"Set {parameter_name} to {parameter_value | 1 << bit}.",
-    )
+    reason = f"Bit {bit} ({fused_quantity}) of {parameter_name} is not set."
+    action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
     if is_height_only(attempt.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {parameter_name} unset."

@@ -13,6 +13,7 @@ Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,6 +28,7 @@ from px4fuse.ekf2.replay_segments import (
     pad_samples,
     sample_steps,
     samples_by_event,
+    update_table,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
@@ -103,8 +105,9 @@ def add_heights(
                 for name in ("bias_m", "bias_m2")
             )
             barometer_bias = bias_m, bias_m2
-        columns = measured_at_s, down_m, dead_zone_m, sample_weight
-        samples_inside = barometer_samples_inside(segment, *columns)
+        samples_inside = barometer_samples_inside(
+            segment, measured_at_s, down_m, dead_zone_m, sample_weight
+        )
         rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
@@ -116,16 +119,11 @@ def add_heights(
 
 
 def barometer_samples_inside(
-    segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array, weight: Array
-) -> tuple[IntArray, Array, Array, Array, Array]:
-    """Return the barometer samples inside a segment.
-
-    For each sample: prediction step that fuses it, time (s), height (m, down), dead zone (m),
-    weight.
-    """
+    segment: ReplaySegment, measured_at_s: Array, *more: Array
+) -> tuple[Any, ...]:
+    """Return step, time (s) and ``more`` (:class:`HeightSamples`) of the samples in a segment."""
     step, is_inside = sample_steps(segment, measured_at_s)
-    measured_at_s, down_m = measured_at_s[is_inside], down_m[is_inside]
-    return step, measured_at_s, down_m, dead_zone_m[is_inside], weight[is_inside]
+    return step, *(values[is_inside] for values in (measured_at_s, *more))
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
@@ -136,10 +134,20 @@ def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[
     """
     heights = segment.heights
     assert heights is not None
-    age_dead_zone_weight = heights.measured_at_s, heights.dead_zone_m, heights.weight
-    columns = heights.down_m[:, None], slice(2, 3), *age_dead_zone_weight
     return pad_samples(
-        [samples_by_event(segment, event_steps, heights.step, *columns) for event_steps in ends]
+        [
+            samples_by_event(
+                segment,
+                event_steps,
+                heights.step,
+                heights.down_m[:, None],
+                slice(2, 3),
+                heights.measured_at_s,
+                heights.dead_zone_m,
+                heights.weight,
+            )
+            for event_steps in ends
+        ]
     )
 
 
@@ -160,8 +168,9 @@ class HeightFilter:
 
     Attributes
     ----------
-    update_log : ndarray, shape (E, k + 2, 3, S)
-        Innovation, S, and 1 if fused: of k barometer samples, GNSS height and GNSS velocity.
+    update_log : ndarray, shape (E, k + 2, 4, S)
+        Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for k barometer samples, GNSS
+        height and GNSS velocity.
     """
 
     def __init__(
@@ -181,10 +190,6 @@ class HeightFilter:
         assert heights is not None
         self.fused = heights.fused
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
-        self.time_s = [*measured_at_s, fix_s]
-        self.update_log = np.full(
-            (len(fix_s), len(self.time_s) + 1, 3, configuration_count), np.nan
-        )
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
         has_barometer = (is_sample > 0.0) & enabled[BAROMETER.name]
         self.has_sample = np.concatenate(
@@ -197,85 +202,62 @@ class HeightFilter:
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
-        start_s = float(segment.time_s[0])
-        self.bias = BiasEstimator(value_m, variance_m2, float(np.median(segment.step_s)))
+        value_m, variance_m2 = np.tile(heights.bias, (configuration_count, 1)).T
+        start_s = segment.time_s[0]
+        self.bias = BiasEstimator(value_m, variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & enabled[heights.reference]
         biased_slots = slice(0, -1) if self.biased[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
+        self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
+        slot_count, event_count, _ = self.time_s.shape
+        self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
         # times of the samples in the order of fusion, event after event
-        sample_s = np.stack(np.broadcast_arrays(*self.time_s, self.has_sample[0])[:-1])
-        sample_s = np.where(self.has_sample, sample_s, start_s)[biased_slots].swapaxes(0, 1)
+        sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
         latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
         interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
     def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one filter configuration with one sensor, at measurement times.
+        """Return the updates of one filter configuration with one sensor.
 
         ``end_s`` is the time of each event.
         """
-        update_rows = []
-        barometer_slot_count = len(self.down_m)
-        for slot in (
-            [barometer_slot_count] if sensor == GNSS_HGT.name else range(barometer_slot_count)
-        ):
-            event_times_s = self.time_s[slot]
-            has_sample = self.has_sample[slot][:, configuration_index]
-            measured_s = event_times_s[
-                has_sample, min(configuration_index, event_times_s.shape[1] - 1)
-            ]
-            updates = self.update_log[has_sample, slot, :, configuration_index].T
-            update_rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
-        measured_s, nu, S, is_fused, end_s = np.hstack(update_rows)
-        update_columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
-        update_columns |= {"rejected": 1.0 - is_fused, "fused": is_fused, "fused_at_s": end_s}
-        return pd.DataFrame(update_columns, pd.Index(measured_s, name="time_s")).sort_index()
+        gnss_slot = len(self.down_m)
+        slots = slice(gnss_slot, gnss_slot + 1) if sensor == GNSS_HGT.name else slice(gnss_slot)
+        update_log = self.update_log[:, slots, :, configuration_index]
+        measured_at_s = self.time_s[slots, :, configuration_index].T
+        return update_table(update_log, measured_at_s, end_s, ["down"])
 
     def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
-            if self.any_sample[slot][e]:
-                age_s = self.age_s[slot, e]
-                column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
-                predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
-                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
-                x, P = self._fuse_innovation(
-                    e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
-                )
+            x, P = self._fuse_sample(
+                e, slot, x, P, self.down_m[slot, e], self.age_s[slot, e], self.noise_m2
+            )
         return x, P
 
     def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
         """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
-        if self.any_sample[-1][e]:
-            column = P[:, :, DOWN]
-            nu = gnss_m - x[:, DOWN]
-            slot = len(self.down_m)
-            x, P = self._fuse_innovation(e, slot, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
-        return x, P
+        return self._fuse_sample(e, len(self.down_m), x, P, gnss_m, np.zeros(1), gnss_m2)
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]
         ratios = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
         if (ratios > MIN_LARGER_RATIO).any():
-            has_sample = self.has_sample[:, max(e - 1, 0) : e + 1].swapaxes(0, 1)
-            ratios[:, :-1] = np.where(has_sample, ratios[:, :-1], np.nan)
             ratios[:, -2] = np.fmax(ratios[:, -2], ratios[:, -1])
             self.bad_acceleration.update(time_s, ratios[0, :-1], ratios[-1, :-1])
 
-    def _fuse_innovation(
-        self,
-        e: int,
-        slot: int,
-        sensor_index: int,
-        x: Array,
-        P: Array,
-        column: Array,
-        predicted_variance: Array,
-        nu: Array,
-        R: Array,
+    def _fuse_sample(
+        self, e: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
     ) -> ArrayPair:
-        """Fuse one height innovation ``nu``; ``column`` is PH', ``predicted_variance`` HPH'."""
+        """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
+        if not self.any_sample[slot][e]:
+            return x, P
+        sensor_index = int(slot == len(self.down_m))
+        # PH' and HPH'
+        column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
+        nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[slot][e]
         if self.biased[sensor_index]:
             nu, R = self.bias.remove_bias(
@@ -293,12 +275,11 @@ class HeightFilter:
         is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
-                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot][e])
+                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot, e])
             )
             innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
-        update_log = self.update_log[e, slot]
-        update_log[0], update_log[1], update_log[2] = nu, S, is_fused
+        self.update_log[e, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
         K = column * (is_fused / (predicted_variance + R / sample_weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

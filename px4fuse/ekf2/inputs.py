@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -38,6 +38,7 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING,
+    POSITION_FILE,
     Columns,
     Ekf2,
     Flight,
@@ -47,7 +48,6 @@ from px4fuse.flight.model import (
     reset_times_s,
     step_values_at,
 )
-from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
@@ -159,11 +159,26 @@ class FusionRules:
     stop_s: float
     reset_s: float
     max_resets: int
-    min_bias_variance: float | None
-    uses_delay_as_horizon: bool
+    min_bias_variance: float | None = None
+    uses_delay_as_horizon: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
     bad_acceleration_s: float = 3.0
+
+
+# Rules of EKF2 v1.14 and later for external vision: EV_MAX_INTERVAL (ev_control.cpp),
+# no_aid_timeout_max and reset_timeout_max (common.h)
+VISION_RULES = FusionRules(start_interval_s=0.2, stop_s=0.4, reset_s=1.0, max_resets=5)
+# Rules of EKF2 v1.16 for GNSS: a reset doubles the variance of the sample
+# (resetHorizontalPositionTo, gps_control.cpp)
+GNSS_RULES = FusionRules(
+    start_interval_s=np.inf,
+    stop_s=np.inf,
+    reset_s=7.0,
+    max_resets=UNLIMITED_RESETS,
+    reset_variance_factor=2.0,
+    resets_velocity=True,
+)
 
 
 @dataclass(frozen=True)
@@ -345,7 +360,7 @@ def lost_imu_fraction(time_s: Array) -> float:
 
 
 def _explain_missing_imu(time_s: Array) -> Unavailable | None:
-    median_interval_s = float(np.median(np.diff(time_s)))
+    median_interval_s = median_interval(time_s)
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
             ANALYSIS_NAME,
@@ -362,30 +377,20 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    min_bias_variance = 5e-8 / step_s**2 if fusion_record.stores_bias_increments else None
-    is_horizon_from_delay = "EKF2_DELAY_MAX" not in fusion_record.parameters
+    rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
-        # gps_control.cpp)
-        reset_variance_factor = 2.0 if fusion_record.stores_latitude else 1.0
         # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
-        resets_together = GNSS_MODE not in fusion_record.parameters
-        return FusionRules(
-            np.inf,
-            np.inf,
-            7.0,
-            UNLIMITED_RESETS,
-            min_bias_variance,
-            is_horizon_from_delay,
-            reset_variance_factor,
-            resets_together,
-            bad_acceleration_s=3.0 if fusion_record.stores_latitude else 10.0,  # BADACC_PROBATION
-        )
-    # EV_MAX_INTERVAL (ev_control.cpp), no_aid_timeout_max and reset_timeout_max (common.h)
-    limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
-    if not uses_aid_mask(fusion_record.parameters):
-        limits = (0.2, 0.4, 1.0, 5)
-    return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
+        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE not in parameters)
+        if not fusion_record.stores_latitude:
+            # bad_acceleration_s: BADACC_PROBATION
+            rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_s=10.0)
+    elif uses_aid_mask(parameters):
+        rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
+    return replace(
+        rules,
+        min_bias_variance=5e-8 / step_s**2 if fusion_record.stores_bias_increments else None,
+        uses_delay_as_horizon="EKF2_DELAY_MAX" not in parameters,
+    )
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
@@ -427,8 +432,7 @@ def read_gnss(
         )
     parameters = fusion_record.parameters
     control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
-    position_samples = track.samples
-    velocity_samples = track.velocity
+    position_samples, velocity_samples = track.samples, track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_log := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
@@ -443,10 +447,11 @@ def read_gnss(
     reported_variance = (
         position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     )
-    velocity = velocity_samples[Columns.VELOCITY].to_numpy()
+    velocity = velocity_variance = None
     fuses_velocity = uses_aid_mask(parameters) or control_bits & GNSS_VELOCITY_BIT
-    velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
-    has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
+    if fuses_velocity and velocity_samples[Columns.VELOCITY].notna().all(axis=None):
+        velocity = velocity_samples[Columns.VELOCITY].to_numpy()
+        velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
@@ -454,8 +459,8 @@ def read_gnss(
         reported_variance.to_numpy(),
         *_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
-        velocity if has_velocity else None,
-        velocity_variance if has_velocity else None,
+        velocity,
+        velocity_variance,
         uses_sender_times=track.assumed_delay_s == 0.0 != logged_delay_s,
     )
 
@@ -641,7 +646,7 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_COPY_INTERVALS_S:
-            median_interval_s = float(np.median(np.diff(track.samples.index)))
+            median_interval_s = median_interval(track.samples.index.to_numpy())
             if (
                 median_interval_s < 0.9 * VISION_COPY_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
+from px4fuse.ekf2.replay_segments import THETA, VELOCITY, ReplaySegment, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
@@ -45,12 +45,9 @@ class EventSamples(NamedTuple):
 
 
 def mean_by_event(
-    sensor_samples: SensorSamples, event_steps: IntArray, imu_velocity_m_s: Array | None = None
+    segment: ReplaySegment, sensor_samples: SensorSamples, event_steps: IntArray
 ) -> EventSamples:
-    """Return the mean of the sensor samples that are fused at each event.
-
-    ``imu_velocity_m_s`` (NED) propagates velocity samples to the event.
-    """
+    """Return the mean of the sensor samples that are fused at each event."""
     event_index = np.searchsorted(event_steps, sensor_samples.step)
     is_inside = event_index < len(event_steps)
     event_count = len(event_steps)
@@ -65,25 +62,17 @@ def mean_by_event(
     value, rotation_to_body, noise = map(
         mean, (sensor_samples.value, sensor_samples.rotation_to_body, sensor_samples.noise)
     )
-    if imu_velocity_m_s is not None:
-        value = value + np.einsum("eab,eb->ea", rotation_to_body, imu_velocity_m_s[event_steps])
+    if VELOCITY in sensor_samples.state_rows:  # propagate velocities to the event with the IMU
+        velocity_m_s = segment.imu_velocity_m_s[event_steps]
+        value = value + np.einsum("eab,eb->ea", rotation_to_body, velocity_m_s)
     sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
     return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
-
-
-def fuse_field(
-    x: Array, P: Array, field_samples: EventSamples, noise_gauss: Array, gate: Array
-) -> tuple[Array, Array, Array]:
-    """Fuse the mean magnetic field of one event, as :func:`fuse_mean`."""
-    R = np.maximum(noise_gauss, MIN_SIGMA_GAUSS) ** 2
-    return fuse_mean(x, P, field_samples, R, gate, EARTH_FIELD, BODY_FIELD)
 
 
 def fuse_mean(
     x: Array,
     P: Array,
     sample_mean: EventSamples,
-    R: Array,
     gate: Array,
     state_rows: slice,
     bias_state_rows: slice | None = None,
@@ -97,15 +86,15 @@ def fuse_mean(
     ----------
     sample_mean : EventSamples
         Mean of one event.
-    R, gate : ndarray, shape (S,)
-        Variance of one sample, and gate in √S.
+    gate : ndarray, shape (S,)
+        Innovation gate in √S.
     state_rows : slice
         State (NED vector) that the sensor measures in the body frame.
     bias_state_rows : slice, optional
         State (body frame) that is added to the measurement.
     """
     measured_state = x[:, state_rows]
-    sample_count = sample_mean.sample_count
+    sample_count, R = sample_mean.sample_count, sample_mean.noise
     cross_state, cross_theta = (
         (vectors @ CROSS_PRODUCT).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
     )

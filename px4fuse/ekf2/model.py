@@ -22,6 +22,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
+    HORIZONTAL_POSITION,
     POSITION_COLUMNS,
     FilterConfiguration,
     SegmentRun,
@@ -33,9 +34,8 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
+    HORIZONTAL,
     MAX_COMPARED_REJECTED_FRACTION,
-    UPDATE_COLUMNS,
-    VELOCITY_UPDATE_COLUMNS,
     Agreement,
     Ekf2Replay,
     agreement_with_log,
@@ -50,6 +50,7 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     ReplaySegment,
+    update_table,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
@@ -57,13 +58,14 @@ from px4fuse.flight.ekf2_parameters import (
     EV_POS,
     FIELD_NOISE_PARAMETERS,
     FLOW,
+    GNSS_HGT,
     GNSS_POS,
     GNSS_VEL,
     MAG,
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, AxisName, Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
@@ -207,11 +209,7 @@ def replay_settings(
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
-                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
-                "the log lacks some fused magnetometer samples",
-            ),
-            (
-                (*MAG.measurement_parameters, *FIELD_NOISE_PARAMETERS),
+                MAG.measurement_parameters.union(FIELD_NOISE_PARAMETERS),
                 "the log lacks some fused magnetometer samples",
             ),
             (
@@ -219,7 +217,7 @@ def replay_settings(
                 height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
             ),
         ):
-            reasons |= dict.fromkeys(unmodelled_parameters & {*parameter_names}, reason)
+            reasons |= dict.fromkeys(unmodelled_parameters & parameter_names, reason)
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         reasons["EKF2_DELAY_MAX"] = (
@@ -239,7 +237,6 @@ def replay_settings(
         )
     if not changes:
         return ()
-    uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
         excluded_rows = matching_sample_rows(inputs.received.stamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
@@ -255,7 +252,7 @@ def replay_settings(
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
-            uses_logged_decisions=uses_logged_decisions,
+            uses_logged_decisions=excluded_s is not None,
             without=without,
         )
         for change in changes
@@ -376,20 +373,23 @@ def _make_replay(
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
     tracks = [_delayed_and_published(inputs, run, configuration_index) for run in runs]
-    updates = [_position_updates(run, configuration_index) for run in runs]
+    updates_by_run = [_updates_by_aid(inputs, run, configuration_index) for run in runs]
+    updates_by_aid = {
+        name: pd.concat([updates[name] for updates in updates_by_run]) for name in updates_by_run[0]
+    }
     return Ekf2Replay(
         settings=configuration.settings,
         changed=dict(changed_parameters),
-        updates=pd.concat(updates),
+        updates=updates_by_aid.pop(inputs.aid.name),
         flow_only_spans_s=tuple(
             span
-            for run, run_updates in zip(runs, updates, strict=True)
+            for run, updates in zip(runs, updates_by_run, strict=True)
             if run.segment.flow is not None
-            for span in _flow_only_spans_s(run_updates, run.segment)
+            for span in _flow_only_spans_s(updates[inputs.aid.name], run.segment)
         ),
         delayed=pd.concat([delayed_track for delayed_track, _ in tracks]),
         published=pd.concat([published_track for _, published_track in tracks]),
-        other_aid_updates=_other_aid_updates(runs, configuration_index),
+        other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
         late=sum(int(run.events[configuration_index].late.sum()) for run in runs),
@@ -404,56 +404,55 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
     return [(a, b) for a, b in pairwise(fusion_times_s) if b - a > RESTART_GAP_S]
 
 
-def _other_aid_updates(
-    runs: Sequence[SegmentRun], configuration_index: int
+def _updates_by_aid(
+    inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with heights, and with vision in addition to GNSS, by PX4's name."""
-    updates_by_aid: dict[str, list[pd.DataFrame]] = {}
-    for run in runs:
-        end_s = run.segment.time_s[run.events[configuration_index].end_step]
-        if (heights := run.heights) is not None:
-            for name in heights.fused:
-                updates_by_aid.setdefault(name, []).append(
-                    heights.updates(name, configuration_index, end_s)
-                )
-        if run.vision is not None:
-            updates_by_aid.setdefault(EV_POS.name, []).append(
-                run.vision.updates(configuration_index, end_s)
-            )
-    return {name: pd.concat(update_frames) for name, update_frames in updates_by_aid.items()}
-
-
-def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
-    events = run.events[configuration_index]
-    has_innovation = np.isfinite(run.innovation[:, configuration_index, POSITION_COLUMNS.start])
-    event_rows = np.flatnonzero(has_innovation)
-    decision_flags = np.stack([run.rejected, run.fused, run.reset], axis=-1)[
-        event_rows, configuration_index
-    ]
-    nu, S, R = (
-        array[event_rows, configuration_index]
-        for array in (run.innovation, run.innovation_variance, run.noise)
+    """Return the updates with each aiding source, by PX4's name."""
+    events, heights = run.events[configuration_index], run.heights
+    end_s = run.segment.time_s[events.end_step]
+    nu, S, R, rejected, fused, reset, variance_after = (
+        array[:, configuration_index]
+        for array in (
+            run.innovation,
+            run.innovation_variance,
+            run.noise,
+            run.rejected,
+            run.fused,
+            run.reset,
+            run.variance[1:],
+        )
     )
-    variance_after = run.variance[event_rows + 1, configuration_index]
-    fused_at_s = run.segment.time_s[events.end_step[event_rows], None]
-    settings = run.configurations[configuration_index].settings
-    # innovations exactly at the gate were clipped and fused; the factor covers rounding
-    velocity_limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
-    velocity_rejected = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1, keepdims=True)
-    # position along north and east (m), then velocity along north, east and down (m/s)
-    position_columns = [
-        nu[:, 3:5],
-        S[:, 3:5],
-        decision_flags,
-        variance_after[:, 6:8],
-        variance_after[:, 3:5],
-    ]
-    update_values = np.hstack(
-        [*position_columns, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3], velocity_rejected]
-    )
-    index = pd.Index(events.time_s[event_rows], name="time_s")
-    updates = pd.DataFrame(update_values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
-    return updates if np.isfinite(nu[:, :3]).any() else updates[UPDATE_COLUMNS]
+
+    def updates_along(axes: Sequence[AxisName], columns: slice, *more: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+        return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
+
+    position_variance = variance_after[:, HORIZONTAL_POSITION]
+    updates_by_aid = {
+        inputs.aid.name: updates_along(
+            HORIZONTAL,
+            POSITION_COLUMNS,
+            rejected,
+            fused,
+            reset,
+            position_variance,
+            R[:, POSITION_COLUMNS],
+        )
+    }
+    if heights is not None:
+        for name in heights.fused:
+            updates_by_aid[name] = heights.updates(name, configuration_index, end_s)
+    if inputs.received.velocity_m_s is not None:
+        gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
+        # innovations exactly at the gate were clipped and fused; the factor covers rounding
+        velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
+        is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
+        # without GNSS height the replay uses the logged EKF2 height
+        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL
+        updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
+    if run.vision is not None:
+        updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)
+    return updates_by_aid
 
 
 def _delayed_and_published(

@@ -61,30 +61,29 @@ def publish(
     velocity_increments = (
         force_m_s2 + np.cross(attitude_difference_rad[1:], force_m_s2) + GRAVITY_M_S2
     ) * step_s
-    dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], velocity_increments]), axis=0)
-    velocity_correction = _follow_offset(
-        state[:, VELOCITY] - dead_reckoned, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
+    velocity_m_s = _follow_state(
+        state[:, VELOCITY], velocity_increments, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
     )
-    velocity_m_s = dead_reckoned + velocity_correction
     # the IMU changes the velocity within a step; corrections apply at the end of the step
     position_increments = (velocity_m_s[:-1] + 0.5 * velocity_increments) * step_s
     # a reset is removed, because EKF2 shifts the whole buffer with a reset
     position_without_resets = state[:, POSITION] - reset_m
-    dead_reckoned = np.cumsum(
-        np.concatenate([position_without_resets[:1], position_increments]), axis=0
-    )
-    position_m = dead_reckoned + _follow_offset(
-        position_without_resets - dead_reckoned, lag_steps, mean_step, settings["EKF2_TAU_POS"]
+    position_m = _follow_state(
+        position_without_resets, position_increments, lag_steps, mean_step, settings["EKF2_TAU_POS"]
     )
     return velocity_m_s, position_m + delay_by(reset_m, lag_steps)
 
 
-def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -> Array:
-    """Return the sum of all corrections, with which the output follows the state.
+def _follow_state(
+    state: Array, increments: Array, lag_steps: int, step_s: float, tau_s: float
+) -> Array:
+    """Return the output: the sum of the IMU's ``increments`` and of the corrections.
 
-    ``offset`` o is the state minus the output without corrections. With gain g and error e_k =
+    The offset o is the state minus the output without corrections. With gain g and error e_k =
     o_(k-lag) - c_k, the sum of corrections is c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
+    dead_reckoned = np.cumsum(np.concatenate([state[:1], increments]), axis=0)
+    offset = state - dead_reckoned
     gain = step_s / np.clip(tau_s, step_s, 10.0)
     integral_gain = INTEGRAL_GAIN * gain**2
     delayed_offset = delay_by(offset - offset[0], lag_steps)
@@ -93,7 +92,7 @@ def _follow_offset(offset: Array, lag_steps: int, step_s: float, tau_s: float) -
         np.array([1.0, gain + integral_gain - 2.0, 1.0 - gain]),
         delayed_offset,
     )
-    return np.asarray(correction_sum + offset[0])
+    return np.asarray(dead_reckoned + (correction_sum + offset[0]))
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:

@@ -1,8 +1,8 @@
 """Result of an EKF2 replay, and its agreement with the log."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, innovation_topic, matching_sample
 from px4fuse.ekf2.replay_segments import SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_HGT, GNSS_VEL, MAG
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
 from px4fuse.flight.model import (
     AXIS_NAMES,
     AidLog,
@@ -40,28 +40,8 @@ from px4fuse.flight.model import (
 from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
+T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
-UPDATE_COLUMNS = [
-    "innovation_north_m",
-    "innovation_east_m",
-    "innovation_variance_north_m2",
-    "innovation_variance_east_m2",
-    "rejected",
-    "fused",
-    "reset",
-    "position_variance_north_m2",
-    "position_variance_east_m2",
-    "velocity_variance_north_m2_s2",
-    "velocity_variance_east_m2_s2",
-    "observation_variance_north_m2",
-    "observation_variance_east_m2",
-    "fused_at_s",
-]
-VELOCITY_UPDATE_COLUMNS = [
-    *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
-    *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
-    "velocity_rejected",
-]
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
@@ -96,7 +76,7 @@ MAX_NIS_DIFFERENCE = 0.25
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
-class AxisAgreement(Record, frozen=True, kw_only=True):
+class AxisAgreement(Record, kw_only=True):
     """Agreement of the EKF2 replay (with logged parameters) with the log, along one axis.
 
     Attributes
@@ -122,7 +102,7 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
     velocity_rms_difference_m_s: NotNegative
 
 
-class Agreement(Record, frozen=True, kw_only=True):
+class Agreement(Record, kw_only=True):
     """Agreement of the EKF2 replay (with logged parameters) with the log.
 
     Attributes
@@ -180,7 +160,7 @@ class Agreement(Record, frozen=True, kw_only=True):
         )
 
 
-class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
+class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     """Replay of EKF2 with one set of parameters.
 
     Attributes
@@ -194,9 +174,9 @@ class Ekf2Replay(Record, frozen=True, kw_only=True, omit_defaults=False):
     late, lost : int
         Number of samples that were fused late, and that were too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
-        Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
+        See :func:`~px4fuse.ekf2.replay_segments.update_table`.
     other_aid_updates : mapping from PX4's name to DataFrame
-        Updates with GNSS height, barometer, and vision in addition to GNSS.
+        Updates with GNSS velocity (m/s), GNSS height, barometer, and vision in addition to GNSS.
     flow_only_spans_s : tuple of (float, float)
         Times in which optical flow was the only horizontal aiding source.
     delayed, published : DataFrame
@@ -248,16 +228,19 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     """Compare a replay (with logged parameters) with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
+    if rows_inside(ekf2.state, replay.evaluated_s).empty:
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
     aid = replayed_aid(ekf2)
-    is_own_topic = innovation_topic(aid) in ekf2.innovation_topics
     position_agreement = _compare_innovations(
-        ekf2, replay, replay.updates, logged_innovations(ekf2), HORIZONTAL, is_own_topic
+        ekf2,
+        replay,
+        replay.updates,
+        logged_innovations(ekf2),
+        innovation_topic(aid) in ekf2.innovation_topics,
     )
     if isinstance(position_agreement, str):
         return Unavailable(
@@ -270,9 +253,6 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         position_agreement.axes, rejected_in_log, rejected_in_replay
     )
     agreements, omitted_aids = _other_agreements(ekf2, replay)
-    velocity_agreement = _compare_velocity(ekf2, replay, is_own_topic)
-    if velocity_agreement == CONSTANT_INNOVATIONS:
-        omitted_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
@@ -287,7 +267,6 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     return Agreement(
         north=position_agreement.axes["north"],
         east=position_agreement.axes["east"],
-        gnss_vel={} if isinstance(velocity_agreement, str) else velocity_agreement.axes,
         **(agreements | {aid.name: position_agreement.axes}),
         doubtful=omitted_aids,
         samples=len(position_agreement.logged),
@@ -307,7 +286,6 @@ def _compare_innovations(
     replay: Ekf2Replay,
     updates: pd.DataFrame,
     logged: pd.DataFrame,
-    axes: Sequence[AxisName],
     is_own_topic: bool,
 ) -> _ComparedInnovations | str:
     """Compare innovations in the evaluated times, or return the reason why this is impossible."""
@@ -321,6 +299,7 @@ def _compare_innovations(
             f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
             f"(at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
+    axes = axes_of(updates)
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
         return CONSTANT_INNOVATIONS
@@ -333,24 +312,25 @@ def _compare_innovations(
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest horizontal position difference (m) with flow only; None without it."""
-    flow_only_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, replay.flow_only_spans_s)
-    ].to_numpy()
-    if not len(flow_only_s):
+    logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
+    if logged_state.empty:
         return None
-    north, east = (
-        component_along(replay.published, Columns.POSITION, direction, flow_only_s)
-        - component_along(ekf2.state, Columns.POSITION, direction, flow_only_s)
-        for direction in np.eye(3)[:2]
+    north_m, east_m = (
+        _replayed_minus_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
     )
-    return float(np.hypot(north, east).max())
+    return float(np.hypot(north_m, east_m).max())
+
+
+def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
+    """Return the difference of a column of the published state at the times of the log."""
+    replayed = np.interp(logged_state.index, replay.published.index, replay.published[name])
+    return np.asarray(replayed - logged_state[name])
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged_state = ekf2.record.delayed
-    logged_state = logged_state[inside_spans(logged_state.index, replay.evaluated_s)]
+    logged_state = rows_inside(ekf2.record.delayed, replay.evaluated_s)
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
@@ -361,42 +341,13 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     return float(np.degrees(rms(difference_rad)))
 
 
-def _compare_velocity(
-    ekf2: Ekf2, replay: Ekf2Replay, is_own_topic: bool
-) -> _ComparedInnovations | str:
-    aid_log = ekf2.aids.get(GNSS_VEL.name)
-    if aid_log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
-        return "GNSS velocity is not fused or not logged"
-    # give the velocity columns the names of position columns
-    renamed_columns: dict[str, str] = {}
-    for axis in AXIS_NAMES:
-        nu = f"innovation_{axis}_m"
-        S = f"innovation_variance_{axis}_m2"
-        renamed_columns |= {
-            f"{nu}_s": nu,
-            f"{S}_s2": S,
-            f"innovation_{axis}": nu,
-            f"variance_{axis}": S,
-        }
-    return _compare_innovations(
-        ekf2,
-        replay,
-        replay.updates.filter([*VELOCITY_UPDATE_COLUMNS, "fused_at_s"]).rename(
-            columns=renamed_columns
-        ),
-        aid_log.samples.rename(columns=renamed_columns),
-        # without height fusion the replay uses the logged EKF2 height
-        AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL,
-        is_own_topic,
-    )
-
-
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of heights and of vision in addition to GNSS, and each disagreement."""
+    """Return the agreement of the other aiding sources, and the reason of each disagreement."""
     agreements: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
-        aid_log = ekf2.aids[name]
+        if (aid_log := ekf2.aids.get(name)) is None:
+            continue
         # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
@@ -406,14 +357,14 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             replay,
             matched_updates,
             logged_aid_innovations(name, aid_log),
-            axes_of(updates),
             innovation_topic(AIDS[name]) in aid_log.topics,
         )
         if isinstance(compared, str):
-            omitted_aids[name] = compared
-            continue
-        agreements[name] = compared.axes
-        is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good, reason = name == GNSS_VEL.name and compared != CONSTANT_INNOVATIONS, compared
+        else:
+            agreements[name] = compared.axes
+            is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good |= name == GNSS_VEL.name
         if not is_good:
             omitted_aids[name] = reason
     return agreements, omitted_aids
@@ -455,6 +406,11 @@ def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
     return is_inside
 
 
+def rows_inside(table: T, spans_s: Spans) -> T:
+    """Return the rows of a table, indexed by time (s), inside one of the spans."""
+    return table[inside_spans(table.index, spans_s)]
+
+
 def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
@@ -479,23 +435,15 @@ def _axis_agreement(
     ekf2: Ekf2,
     ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log = (
-        innovations[f"innovation_{axis}_m"].to_numpy()
-        for innovations in (replayed_innovations, logged_innovations)
-    )
-    S, S_log = (
-        innovations[f"innovation_variance_{axis}_m2"].to_numpy()
+    nu, nu_log, S, S_log = (
+        innovations[name].to_numpy()
+        for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
         for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
-    evaluated_state_s = ekf2.state.index[
-        inside_spans(ekf2.state.index, ekf2_replay.evaluated_s)
-    ].to_numpy()
-    direction = np.eye(3)[AXIS_NAMES.index(axis)]
+    logged_state = rows_inside(ekf2.state, ekf2_replay.evaluated_s)
     position_m, velocity_m_s = (
-        component_along(ekf2_replay.published, columns, direction, evaluated_state_s)
-        - component_along(ekf2.state, columns, direction, evaluated_state_s)
-        for columns in (Columns.POSITION, Columns.VELOCITY)
+        _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),

@@ -13,11 +13,20 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, median_interval
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
+from px4fuse.flight.model import (
+    BAD_ACCELERATION,
+    AxisName,
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    Unavailable,
+    time_index,
+)
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -92,6 +101,9 @@ class SensorSamples:
         R of one sample; 0 if R is a parameter.
     gate : float
         Innovation gate in √S; infinite if the gate is a parameter.
+    state_rows : tuple of slice
+        State (NED vector) that the sensor measures in the body frame and, optionally, state (body
+        frame) that is added to the measurement.
     """
 
     step: IntArray
@@ -100,6 +112,7 @@ class SensorSamples:
     sample_count: Array
     noise: Array
     gate: float = np.inf
+    state_rows: tuple[slice, ...] = (EARTH_FIELD, BODY_FIELD)
 
 
 @dataclass(frozen=True)
@@ -271,6 +284,40 @@ def samples_by_event(
     return samples
 
 
+def update_table(
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+) -> pd.DataFrame:
+    """Return the updates with one aiding source, in the order of fusion, at measurement times.
+
+    Parameters
+    ----------
+    update_log : ndarray, shape (E, k, ...)
+        For k samples of each event: ν and S along each axis, 1 for a sample that was rejected,
+        fused, or used for a reset, position variance after the update and R along each axis (the
+        last quantities are optional). NaN without a sample.
+    measured_at_s : ndarray, shape (E, k)
+    end_s : ndarray, shape (E,)
+        Time of each event.
+    axes : sequence of str
+    """
+    has_innovation = np.isfinite(update_log[..., 0])
+    columns = [
+        *(f"innovation_{axis}_m" for axis in axes),
+        *(f"innovation_variance_{axis}_m2" for axis in axes),
+        "rejected",
+        "fused",
+        "reset",
+        *(f"position_variance_{axis}_m2" for axis in axes),
+        *(f"observation_variance_{axis}_m2" for axis in axes),
+    ]
+    updates = pd.DataFrame(
+        update_log[has_innovation],
+        time_index(measured_at_s[has_innovation]),
+        columns[: update_log.shape[-1]],
+    )
+    return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
+
+
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
     """Pad the arrays of :func:`samples_by_event` to the same number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
@@ -313,6 +360,11 @@ def find_replay_segments(
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cut_times_s += [change.time_s for change in parameter_changes]
+
+    def make_segment(start_row: int, end_s: float) -> ReplaySegment:
+        segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
+        return _with_gnss_model(segment, imu, ekf2, fusion_record) if is_gnss else segment
+
     segments = []
     for low_s, high_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
         fused_inside = fused_s[(fused_s >= low_s) & (fused_s <= high_s)]
@@ -335,19 +387,17 @@ def find_replay_segments(
         is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high_s)
         if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
             continue
-        segment_inputs = imu, attitude, ekf2, fusion_record
         changed = {
             change.name: change.after for change in parameter_changes if change.time_s <= low_s
         }
-        make_segment = _make_gnss_segment if is_gnss else _make_segment
-        segment = make_segment(*segment_inputs, start_row, high_s)
+        segment = make_segment(start_row, high_s)
         history_row = int(
             np.searchsorted(
                 state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
             )
         )
         if history_row < start_row:
-            history = make_segment(*segment_inputs, history_row, state_times_s[start_row])
+            history = make_segment(history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
         if field_span and field_span[0] <= state_times_s[start_row] and high_s <= field_span[1]:
             segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
@@ -355,23 +405,17 @@ def find_replay_segments(
     return tuple(segments)
 
 
-def _make_gnss_segment(
-    imu: pd.DataFrame,
-    attitude: pd.DataFrame,
-    ekf2: Ekf2,
-    fusion_record: FusionRecord,
-    start_row: int,
-    end_s: float,
+def _with_gnss_model(
+    segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Make a segment with earth rotation, positions in EKF2's metres, and bad accelerations."""
-    segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
+    """Add earth rotation, positions in EKF2's metres, and bad accelerations to a segment."""
     metres_per_metre = ekf2_metres_per_metre(fusion_record)
     initial_state = segment.state.copy()
     initial_state[POSITION] *= metres_per_metre
     earth_rotation_rad = earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
-    start_s, end_s = segment.time_s[[0, -1]]
-    velocity_down_m_s = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
-    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity_down_m_s)[0]
+    start_s, end_s = span_s = segment.time_s[[0, -1]]
+    velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
+    velocity_error = segment.imu_velocity_m_s[-1, 2] - velocity_change_m_s
     return replace(
         segment,
         state=initial_state,
@@ -395,7 +439,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         clipped_s = imu_s[imu["clipped"].to_numpy() > 0.0]
         begin_rows, end_rows = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
         clipped_moments = clipped_s[
-            end_rows - begin_rows > MAX_CLIPPED_FRACTION / float(np.median(np.diff(imu_s)))
+            end_rows - begin_rows > MAX_CLIPPED_FRACTION / median_interval(imu_s)
         ]
         break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return break_times_s
@@ -460,9 +504,7 @@ def _make_segment(
     nominal_attitude = multiply(extra_rotation, gyro_attitude)
     state_times_s, state_rotation = relative_attitude(fusion_record.delayed, 1e-4, nominal_attitude)
     attitude_error_rad = to_vector(state_rotation)
-    published_m = [
-        np.interp(step_times_s[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION
-    ]
+    published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_m)
     # from PX4 v1.16 on, the height of the state has another origin than the published height
@@ -478,19 +520,13 @@ def _make_segment(
             [attitude_error_rad[0], initial_row[Columns.VELOCITY], position_m, np.zeros(6)]
         ),
         variance=np.asarray(initial_row[Columns.DELAYED_VARIANCE[:15]]),
-        down_m=_interpolate(ekf2.state["down_m"], step_times_s),
-        attitude_variance_rad2=np.column_stack(
-            [
-                _interpolate(fusion_record.delayed[name], step_times_s)
-                for name in Columns.DELAYED_VARIANCE[:3]
-            ]
+        down_m=_interpolate(ekf2.state[["down_m"]], step_times_s)[:, 0],
+        attitude_variance_rad2=_interpolate(
+            fusion_record.delayed[Columns.DELAYED_VARIANCE[:3]], step_times_s
         ),
-        down_variance_m2=_interpolate(fusion_record.delayed["down_m2"], step_times_s),
-        attitude_error_rad=np.column_stack(
-            [
-                np.interp(step_times_s, state_times_s, component)
-                for component in attitude_error_rad.T
-            ]
+        down_variance_m2=_interpolate(fusion_record.delayed[["down_m2"]], step_times_s)[:, 0],
+        attitude_error_rad=_interpolate(
+            pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
         ),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
@@ -510,7 +546,7 @@ def _field_span(fusion_record: FusionRecord) -> Span | None:
     )
     fused_3d_s = is_fused_3d.index.to_numpy()
     is_fused = is_fused_3d.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / np.median(np.diff(fused_3d_s)) < MIN_MAG_LOG_HZ:
+    if not is_fused.any() or 1.0 / median_interval(fused_3d_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
@@ -525,7 +561,7 @@ def _add_field(
     field_gauss = fusion_record.field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    samples_per_row = max(MAG_FUSION_HZ * float(np.median(np.diff(sample_times_s))), 1.0)
+    samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
     field_values = field_gauss.iloc[:, :3].to_numpy()
     field_states = np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]])
@@ -564,9 +600,7 @@ def _mean_field(
     )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
     earth, body = (
-        np.column_stack(
-            [np.interp(measured_at_s, delayed_state.index, delayed_state[name]) for name in names]
-        )
+        _interpolate(delayed_state[names], measured_at_s)
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
     rotated_earth_field = earth[:, None] - np.cross(
@@ -652,8 +686,9 @@ def predict_s(fusion_record: FusionRecord) -> float:
     return fusion_record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
-def _interpolate(series: pd.Series, times_s: Array) -> Array:
-    return np.asarray(np.interp(times_s, series.index, series))
+def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
+    """Interpolate the columns of a table, indexed by time (s)."""
+    return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
 
 
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:

@@ -21,11 +21,18 @@ from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Rec
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, component_along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import (
+    Ekf2Replay,
+    Spans,
+    component_along,
+    inside_spans,
+    rms_to_truth,
+    rows_inside,
+)
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
+from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
@@ -47,13 +54,15 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "rejections and resets"
 OUTPUT = "output predictor"
+# Steps of further aiding sources of the position
+FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
 # Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
 STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
-class Step(Record, frozen=True, kw_only=True):
+class Step(Record, kw_only=True):
     """Replacement of one property of KF by that of EKF2, and its effect.
 
     Attributes
@@ -76,7 +85,7 @@ class Step(Record, frozen=True, kw_only=True):
     position_rmse_to_truth_m: NotNegative | None = None
 
 
-class RejectionRun(Record, frozen=True, kw_only=True):
+class RejectionRun(Record, kw_only=True):
     """Longest run of consecutive position samples that EKF2 rejected in flight.
 
     Attributes
@@ -93,14 +102,14 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     distance_m: NotNegative
 
 
-class UnreplayedDifference(Record, frozen=True):
+class UnreplayedDifference(Record):
     """Largest position difference KF - EKF2 at times that the replay does not cover."""
 
     maximum_m: NotNegative
     at_s: float
 
 
-class DifferenceExplanation(Record, frozen=True, kw_only=True):
+class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
     The mean square is the sum of the reductions by all ``steps`` and of the unexplained remainder.
@@ -271,46 +280,42 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
-    replayed_aids = modelled_aids(inputs)
-    other_aids = [name for name in (FLOW.name, EV_POS.name) if name in replayed_aids[1:]]
+    replayed_aids = modelled_aids(inputs)[1:]
+    further_steps = {aid: step for aid, step in FURTHER_STEPS.items() if aid in replayed_aids}
+    further_aids = [*further_steps]
     kf_configuration = FilterConfiguration(
         kf_parameters,
         estimates_biases=False,
         estimates_attitude=False,
-        fuses_velocity=False,
         uses_reported_noise=False,
         has_gate=False,
-        without=dict.fromkeys((MAG.name, *other_aids), 0.0),
+        fuses_velocity=False,
+        without=dict.fromkeys((MAG.name, *further_aids), 0.0),
     )
+    noise_configuration = replace(
+        kf_configuration, settings=kf_process_noise, uses_reported_noise=True
+    )
+    process_configuration = replace(
+        noise_configuration, settings=logged_settings, estimates_biases=True
+    )
+    configuration = replace(process_configuration, estimates_attitude=True)
     configurations = {
         SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
         TIMESTAMPS: kf_configuration,
-        NOISE: (
-            noise_configuration := replace(
-                kf_configuration, settings=kf_process_noise, uses_reported_noise=True
-            )
-        ),
+        NOISE: noise_configuration,
         BIASES: replace(noise_configuration, estimates_biases=True),
-        PROCESS: replace(noise_configuration, settings=logged_settings, estimates_biases=True),
-        ATTITUDE: (
-            configuration := replace(
-                noise_configuration,
-                settings=logged_settings,
-                estimates_biases=True,
-                estimates_attitude=True,
-            )
-        ),
+        PROCESS: process_configuration,
+        ATTITUDE: configuration,
     }
     if MAG.name in replayed_aids:
         configurations[FIELD_STEP] = configuration = replace(
-            configuration, without=dict.fromkeys(other_aids, 0.0)
+            configuration, without=dict.fromkeys(further_aids, 0.0)
         )
-    if inputs.received.velocity_m_s is not None:
+    if GNSS_VEL.name in replayed_aids:
         configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
-    for insertion_index, name in enumerate(other_aids, start=1):
-        step = FLOW_STEP if name == FLOW.name else VISION_STEP
+    for next_index, step in enumerate(further_steps.values(), start=1):
         configurations[step] = configuration = replace(
-            configuration, without=dict.fromkeys(other_aids[insertion_index:], 0.0)
+            configuration, without=dict.fromkeys(further_aids[next_index:], 0.0)
         )
     return configurations | {GATE: FilterConfiguration(logged_settings, uses_logged_decisions=True)}
 
@@ -318,7 +323,7 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 def _longest_rejection(
     baseline_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
-    updates = baseline_replay.updates[inside_spans(baseline_replay.updates.index, spans_s)]
+    updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fused_at_s = updates["fused_at_s"].to_numpy()

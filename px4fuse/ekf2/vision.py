@@ -21,8 +21,12 @@ from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
-from px4fuse.ekf2.replay import UPDATE_COLUMNS
-from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_event
+from px4fuse.ekf2.replay_segments import (
+    ReplaySegment,
+    pad_samples,
+    samples_by_event,
+    update_table,
+)
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
@@ -89,7 +93,7 @@ class VisionFilter:
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        The first seven of :data:`UPDATE_COLUMNS` for each sample; NaN without an innovation.
+        Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for each sample.
     position_reset_m : ndarray, shape (E, S, 2)
         Change of the position by a reset at each event, north and east.
     fused_s : ndarray, shape (S,)
@@ -126,27 +130,18 @@ class VisionFilter:
         self.noise_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
         )
-        start_s = float(segment.time_s[0])
         bias = np.zeros((configuration_count, 2))
-        self.bias = BiasEstimator(bias, bias + np.inf, float(np.median(segment.step_s)))
+        self.bias = BiasEstimator(bias, bias + np.inf, segment.step_s)
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
-        self.fused_s = np.full(configuration_count, start_s)
+        self.fused_s = np.full(configuration_count, segment.time_s[0])
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the vision updates of one filter configuration, in the order of fusion.
-
-        The index is the time of measurement; ``end_s`` is the time of each event.
-        """
-        update_log = self.update_log[..., configuration_index]
+        """Return the updates of one filter configuration; ``end_s`` is the time of each event."""
         measured_at_s = self.measured_at_s[..., configuration_index].T
-        has_innovation = np.isfinite(update_log[:, :, 0])
-        index = pd.Index(measured_at_s[has_innovation], name="time_s")
-        updates = pd.DataFrame(
-            update_log[has_innovation], index, UPDATE_COLUMNS[: update_log.shape[-1]]
+        return update_table(
+            self.update_log[..., configuration_index], measured_at_s, end_s, ["north", "east"]
         )
-        event, _ = np.nonzero(has_innovation)
-        return updates.assign(fused_at_s=end_s[event])
 
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
         """Fuse the vision samples of one event.

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
+from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, NotNegative, Record, Share
+from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
+from px4fuse.ekf2.heights import SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -27,6 +28,7 @@ from px4fuse.ekf2.replay import (
     logged_aid_innovations,
     logged_innovations,
     rms_to_truth,
+    rows_inside,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -62,6 +64,7 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Take the height from the log (vehicle_local_position).",
 )
+HEIGHT_NAMES = {aid.name for aid in SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
@@ -86,7 +89,7 @@ MAX_REJECTED_SPREAD = 0.03
 MAX_RMSE_RATIO = 1.15
 
 
-class AxisSummary(Record, frozen=True):
+class AxisSummary(Record):
     """EKF2 statistics along one axis in one column of the parameter table.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
@@ -99,7 +102,7 @@ class AxisSummary(Record, frozen=True):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-class HeightSummary(Record, frozen=True):
+class HeightSummary(Record):
     """Statistics of one height sensor, or of vision that EKF2 fuses in addition to GNSS."""
 
     nis_mean: NotNegative
@@ -115,7 +118,7 @@ class HeightSummary(Record, frozen=True):
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
 
-class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
+class Summary(Record, kw_only=True, omit_defaults=False):
     """EKF2 statistics in one column of the parameter table: logged, replayed, or changed.
 
     Attributes
@@ -291,8 +294,8 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
     >>> sweep_values("EKF2_EV_DELAY", 0, 200, 3)
     [0.0, 100.0, 200.0]
     """
-    check_parameters({name: low})
-    check_parameters({name: high})
+    for limit in (low, high):
+        check_parameters({name: limit})
     if not low < high:
         raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller parameter value first.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
@@ -355,7 +358,7 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
-    evaluated_updates = updates[inside_spans(updates.index, evaluated_s)]
+    evaluated_updates = rows_inside(updates, evaluated_s)
     fused_at_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
@@ -371,9 +374,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         )
         variance_after = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
-    fused_s = evaluated_updates["fused_at_s"][
-        (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
-    ]
+    fused_s = evaluated_updates["fused_at_s"][evaluated_updates[["fused", "reset"]].any(axis=1)]
     reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
         reset_count += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
@@ -387,32 +388,28 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused_s.to_numpy(), evaluated_s),
+        longest_without_fusion_s=_longest_between_fusions(fused_s, evaluated_s),
         resets=int(reset_count),
         late=replay.late,
         lost=replay.lost,
-        velocity_rejected_fraction=_mean_rejected(
-            evaluated_updates, "velocity_rejected", evaluated_s
-        ),
     )
 
 
 def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged_updates = logged_innovations(ekf2)
-    evaluated_updates = logged_updates[inside_spans(logged_updates.index, evaluated_s)]
+    evaluated_updates = rows_inside(logged_innovations(ekf2), evaluated_s)
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     reset_times_s = horizontal_resets_s(ekf2) - horizon_s
     reset_times_s = reset_times_s[inside_spans(reset_times_s, evaluated_s)]
-    replayed_count = int(inside_spans(replay.updates.index, evaluated_s).sum())
+    replayed_count = len(rows_inside(replay.updates, evaluated_s))
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed_count} innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed_count:
-        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
+        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
         longest_gap_s = _longest_between_fusions(
             np.concatenate([fused_s, reset_times_s]), evaluated_s
         )
@@ -420,7 +417,9 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     assert isinstance(flight.attitude, pd.DataFrame)
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
-        name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates
+        name: logged_aid_innovations(name, ekf2.aids[name])
+        for name in replay.other_aid_updates
+        if name in ekf2.aids
     }
     return _make_summary(
         flight,
@@ -434,18 +433,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         changed={},
         longest_without_fusion_s=longest_gap_s,
         resets=len(reset_times_s),
-        velocity_rejected_fraction=(
-            _mean_rejected(ekf2.aids[GNSS_VEL.name].samples, "rejected", evaluated_s)
-            if "velocity_rejected" in replay.updates and GNSS_VEL.name in ekf2.aids
-            else None
-        ),
     )
-
-
-def _mean_rejected(samples: pd.DataFrame, column: str, evaluated_s: Spans) -> float | None:
-    """Return the fraction of rejected samples in the evaluated times; None without samples."""
-    is_rejected = samples.loc[inside_spans(samples.index, evaluated_s)].get(column)
-    return None if is_rejected is None or is_rejected.empty else float(is_rejected.mean())
 
 
 def _make_summary(
@@ -466,7 +454,7 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged_variance = ekf2.variance
-    evaluated_state_s = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
+    evaluated_state_s = rows_inside(ekf2.state, evaluated_s).index.to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position_m = component_along(
@@ -480,9 +468,7 @@ def _make_summary(
         if isinstance(logged_variance, Unavailable):
             sigma = logged_variance
         else:
-            variance_s = logged_variance.index[
-                inside_spans(logged_variance.index, evaluated_s)
-            ].to_numpy()
+            variance_s = rows_inside(logged_variance, evaluated_s).index
             axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
             sigma = float(
                 np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
@@ -490,15 +476,17 @@ def _make_summary(
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
-    heights = {
+    aids = {
         name: _summarise_aid(evaluated, evaluated_s)
         for name, updates in other_aid_updates.items()
-        if len(evaluated := updates[inside_spans(updates.index, evaluated_s)])
+        if len(evaluated := rows_inside(updates, evaluated_s))
     }
-    if vision := heights.pop(EV_POS.name, None):
+    if velocity := aids.pop(GNSS_VEL.name, None):
+        more["velocity_rejected_fraction"] = velocity.rejected_fraction
+    if vision := aids.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
-    if other_aid_updates.keys() - {EV_POS.name}:
-        more["heights"] = heights
+    if other_aid_updates.keys() & HEIGHT_NAMES:
+        more["heights"] = aids
         more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
@@ -517,15 +505,13 @@ def _innovation_statistics(
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
-    rejected_flags = evaluated_updates["rejected"].to_numpy()
-    fused_s = evaluated_updates.index.to_numpy()[rejected_flags == 0.0]
+    fused = evaluated_updates[evaluated_updates["rejected"] == 0.0]
     longest_s = max(
-        _longest_between_fusions(fused_s[inside_spans(fused_s, (span,))], (span,))
-        for span in evaluated_s
+        _longest_between_fusions(rows_inside(fused, (span,)).index, (span,)) for span in evaluated_s
     )
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
-        float(rejected_flags.mean()),
+        float(evaluated_updates["rejected"].mean()),
         longest_s,
     )
 
@@ -539,7 +525,7 @@ def _heading_error(
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    heading = heading[inside_spans(heading.index, evaluated_s)]
+    heading = rows_inside(heading, evaluated_s)
     true_heading = np.interp(
         heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
@@ -547,25 +533,23 @@ def _heading_error(
     return float(np.degrees(np.nanmean(error_rad)))
 
 
-def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
+def _longest_between_fusions(fused_s: ArrayLike, evaluated_s: Spans) -> float:
     fusion_times_s = [evaluated_s[0][0], evaluated_s[-1][1]]
-    return float(np.max(np.diff(np.sort(np.concatenate([fused_s, fusion_times_s])))))
+    return float(np.diff(np.sort(np.append(fusion_times_s, fused_s))).max())
 
 
 def _deviation_note(
     model: Model, replay: Ekf2Replay, replays_without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
-    position_difference_m = (
-        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION]
+    position_difference_m = rows_inside(
+        replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION],
+        evaluated_s,
     )
-    position_difference_m = position_difference_m[
-        inside_spans(position_difference_m.index, evaluated_s)
-    ]
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m = np.hypot(*horizontal_m)
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
-    height_aids = {*model.baseline_replay.other_aid_updates} - {EV_POS.name}
+    height_aids = HEIGHT_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     height_note = (
         f". The published height differs by at most {down_difference_m.max():.3g} m"

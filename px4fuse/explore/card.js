@@ -1,5 +1,5 @@
-/* Diagnosis card for the settings of the page: axis of σ ratios, headline and effect. Numbers and words
-   as in px4fuse.card. */
+// Diagnosis card for the settings of the page: axis of σ ratios, headline and effect. Numbers and words
+// as in px4fuse.card.
 const Card = (() => {
   const NAMES = { source: "the source", truth: "ground truth" };
   // format_ratio and format_metres of core/text.py
@@ -9,9 +9,9 @@ const Card = (() => {
 
   function start({ bands, ends, marks }, suffix) {
     const figures = new Map([...$(`figures${suffix}`).content.children].map((figure) => [figure.dataset.axis, figure]));
-    let analysed = null; // texts of the card with the settings of the analysis
+    // texts of the card with the settings of the analysis
+    let analysed = null;
 
-    const fraction = (ratio) => Math.log(ratio / ends[0]) / Math.log(ends[1] / ends[0]);
     /* Verdict on a ratio (verdicts.py): consistent in its band, or if its 95 % interval contains 1 */
     function wordOf(ratio, against, interval) {
       const [low, high] = bands[against];
@@ -43,7 +43,7 @@ const Card = (() => {
         const show = (node, isShown) => node.setAttribute("display", isShown ? "inline" : "none");
         show(was, isChanged);
         for (const line of row.querySelectorAll(".interval")) show(line, !isChanged);
-        const value = isChanged ? verdict.ratio : axis.ratios[i], place = fraction(value);
+        const value = isChanged ? verdict.ratio : axis.ratios[i], place = axisFraction(value, ends);
         mark.setAttribute("x", `${100 * clamp(place, 0, 1)}%`);
         mark.firstChild.setAttribute("d", marks[place < 0 ? "below" : place > 1 ? "above" : verdict.against]);
         const shown = isChanged ? { ratio: formatRatio(value), word: verdict.word, isLoud: verdict.word !== "consistent" }
@@ -66,7 +66,8 @@ const Card = (() => {
     function showTexts(now, effect, isChanged) {
       const [sign, headlineNode, effectNode, recorded] = ["sign", "headline", "effect", "recorded"]
         .map((name) => query(`#card [data-part=${name}]`));
-      if (headlineNode === null) return; // practice hides them before the answer
+      // practice hides them before the answer
+      if (headlineNode === null) return;
       analysed ??= { sign: sign.textContent, headline: headlineNode.textContent, effect: effectNode.textContent,
         className: sign.className };
       const shown = isChanged ? { sign: "SETTINGS CHANGED", headline: headline(now), effect, className: "sign note" } : analysed;
@@ -74,7 +75,8 @@ const Card = (() => {
       headlineNode.textContent = shown.headline;
       effectNode.textContent = shown.effect;
       recorded.hidden = !isChanged;
-      query("#card .do")?.toggleAttribute("hidden", isChanged); // its advice is for the analysed settings
+      // its advice is for the analysed settings
+      query("#card .do")?.toggleAttribute("hidden", isChanged);
       recorded.textContent = `With the analysed settings: ${analysed.sign} ${analysed.headline}`;
     }
     return { showAxis, moveMarks, showTexts, verdicts };

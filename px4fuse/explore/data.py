@@ -1,5 +1,6 @@
 """Data of one flight for the explore page, which runs KF in the browser."""
 
+from dataclasses import asdict
 from typing import Any
 
 import msgspec
@@ -17,10 +18,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import (
-    SETTING_RANGES,
-    Settings,
-)
+from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -42,7 +40,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
     assert request is not None
     return {
         "log": analysis.flight.log.name,
-        "settings": _settings_data(analysis.settings),
+        "settings": asdict(analysis.settings),
         "main": analysis.main.axis.name,
         "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
         **signals,
@@ -52,9 +50,9 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
         ],
         "likely": _likely_noises(analysis),
         "events": {
-            "gap": list(events.gaps),
-            "dropout": list(events.dropouts),
-            "ground": list(events.ground),
+            "gap": events.gaps,
+            "dropout": events.dropouts,
+            "ground": events.ground,
             "reset": list(events.resets_s),
         },
         "command": _command_data(request, analysis),
@@ -70,19 +68,17 @@ def replay_signals(comparison: Comparison, packer: Packer) -> PageData:
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _imu_data(comparison, packer),
-        "axes": [_axis_signals(comparison, line, source, packer) for line in comparison.lines],
+        "axes": [_axis_signals(comparison, axis, source, packer) for axis in comparison.input_axes],
     }
 
 
 def ranges() -> PageData:
     """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
     return {
-        "sigma-a": SETTING_RANGES["sigma_a_m_s2"][:2],
-        "sigma-z": SETTING_RANGES["sigma_z_m"][:2],
-        "dt": SETTING_RANGES["dt_s"][:2],
-        "lesson": _settings_data(Settings()),
+        "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
+        "lesson": asdict(Settings()),
         "bands": CONSISTENT_RATIOS,
-        "ends": list(RATIO_AXIS_ENDS),
+        "ends": RATIO_AXIS_ENDS,
         "marks": MARK_PATHS,
     }
 
@@ -90,16 +86,6 @@ def ranges() -> PageData:
 def raw_source(comparison: Comparison) -> PositionTrack:
     """Return the position source without the applied time offset."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
-
-
-def _settings_data(settings: Settings) -> PageData:
-    return {
-        "sigmaA": settings.sigma_a_m_s2,
-        "sigmaZ": settings.sigma_z_m,
-        "dt": settings.dt_s,
-        "input": settings.input,
-        "offset": settings.clock_offset_s,
-    }
 
 
 def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
@@ -119,20 +105,19 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
 
 def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     """Return times, gaps and span of the acceleration, or the reason why it is missing."""
-    acceleration = comparison.lines[0].acceleration
+    acceleration = comparison.input_axes[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time_s = acceleration.time_s
     gap_starts = np.flatnonzero(imu_gaps(time_s))
     gap_edges_s = np.stack([time_s[gap_starts], time_s[gap_starts + 1]], 1)
-    cumulative_gap_s = np.cumsum(gap_edges_s[:, 1] - gap_edges_s[:, 0])
+    gap_sum_s = np.cumsum(np.diff(gap_edges_s, prepend=gap_edges_s[:, :1]))
     return {
         "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_edges_s.ravel().tolist(),
-        "gapSum": np.stack([np.concatenate([[0.0], cumulative_gap_s])[:-1], cumulative_gap_s], 1)
-        .ravel()
-        .tolist(),
+        # cumulative duration of the gaps at these edges
+        "gapSum": gap_sum_s.tolist(),
     }
 
 
@@ -242,8 +227,6 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
         )
         variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2_data["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
-    else:
-        ekf2_data["why"] = result.ekf2_innovations.reason
     return ekf2_data
 
 
@@ -282,7 +265,7 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
     }
 
 
-def _command_data(request: ComparisonRequest, comparison: Comparison) -> PageData:
+def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return the `compare` command, with automatic and with explicit segment and aisle.
 
     Automatic segment and aisle depend on the clock offset, so a command with another offset states
@@ -292,22 +275,20 @@ def _command_data(request: ComparisonRequest, comparison: Comparison) -> PageDat
     automatic_request = msgspec.structs.replace(
         request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
-    aisle_heading_deg = next(
-        (line.heading_deg for line in comparison.lines if line.name == AISLE), None
-    )
+    heading_deg = request.heading_deg
+    if heading_deg is None and AISLE in analysis.axes:
+        heading_deg = analysis[AISLE].heading_deg
     explicit_request = msgspec.structs.replace(
         automatic_request,
-        start_s=comparison.segment.start_s,
-        end_s=comparison.segment.end_s,
-        heading_deg=aisle_heading_deg
-        if automatic_request.heading_deg is None
-        else automatic_request.heading_deg,
+        start_s=analysis.segment.start_s,
+        end_s=analysis.segment.end_s,
+        heading_deg=heading_deg,
     )
     return {
         "base": command_line(automatic_request, for_shell=True),
         "fixed": command_line(explicit_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
-        if isinstance(comparison.lines[0].acceleration, Unavailable)
+        if isinstance(analysis.main.axis.acceleration, Unavailable)
         else "imu",
     }

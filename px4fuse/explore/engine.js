@@ -1,15 +1,13 @@
-/* KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
-   steps, the same mean acceleration per step, the same Joseph update. */
+// KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
+// steps, the same mean acceleration per step, the same Joseph update.
 "use strict";
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 /* Response with the decompressed bytes of a base64 text */
 const inflate = (text) => new Response(new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))])
   .stream().pipeThrough(new DecompressionStream("deflate")));
 const Engine = (() => {
-  const SAME_TIME_S = 5e-7; // steps.MAX_SAME_TIME_S
-  const MIN_MEASUREMENTS = 3; // signals.MIN_MEASUREMENTS
-  const MIN_COMMON_SAMPLES = 3; // projection.MIN_COMMON_SAMPLES
-  const MIN_INNOVATIONS = 10; // consistency.MIN_INNOVATIONS
+  // steps.MAX_SAME_TIME_S, signals.MIN_MEASUREMENTS, projection.MIN_COMMON_SAMPLES, consistency.MIN_INNOVATIONS
+  const SAME_TIME_S = 5e-7, MIN_MEASUREMENTS = 3, MIN_COMMON_SAMPLES = 3, MIN_INNOVATIONS = 10;
 
   /* numpy.interp for ascending x; `outside` replaces the end values beyond the range of xp */
   function interp(x, xp, fp, outside) {
@@ -29,7 +27,7 @@ const Engine = (() => {
   function stepMeans(imu, axis, edges) {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
-    const n = edges.length - 1, mean = new Float64Array(n), gapFraction = new Float64Array(n);
+    const n = edges.length - 1, mean = new Float64Array(n), gapFraction = mean.slice();
     const clip = (t) => clamp(t, ...imu.span);
     for (let i = 0; i < n; i++) {
       const length = edges[i + 1] - edges[i];
@@ -52,7 +50,7 @@ const Engine = (() => {
 
   /* Time steps of KF: grid of DT and measurement times (kalman.timeline) */
   function timeline(flight, axis, settings) {
-    const { time: all, z } = measured(axis, flight.segment, settings.offset);
+    const { time: all, z } = measured(axis, flight.segment, settings.clock_offset_s);
     if (all.length < MIN_MEASUREMENTS) return null;
     const first = all[0], times = [], index = [];
     for (let i = 1; i < all.length; i++) {
@@ -63,11 +61,11 @@ const Engine = (() => {
     }
     if (!times.length) return null;
     const m = times.length, last = times[m - 1];
-    const count = Math.floor((last - first) / settings.dt + 1e-9) + 1;
+    const count = Math.floor((last - first) / settings.dt_s + 1e-9) + 1;
     const time = new Float64Array(count + m + 1), measurement = new Int32Array(count + m + 1).fill(-1);
     let n = 0, j = 0;
     for (let k = 0; k < count; k++) {
-      const t = first + settings.dt * k;
+      const t = first + settings.dt_s * k;
       while (j < m && times[j] < t) { measurement[n] = index[j]; time[n++] = times[j++]; }
       const near = Math.min(
         Math.abs(times[Math.min(j, m - 1)] - t), Math.abs(times[Math.max(j - 1, 0)] - t));
@@ -79,17 +77,15 @@ const Engine = (() => {
 
   /* Mean acceleration (m/s²) of each KF step, and its additional variance in IMU gaps */
   function inputs(flight, axis, settings, line) {
-    const n = line.time.length - 1;
-    if (settings.input === "zero") {
-      return { mean: new Float64Array(n), extra: new Float64Array(n) };
-    }
+    const n = line.time.length - 1, extra = new Float64Array(n);
+    if (settings.input === "zero") return { mean: extra, extra };
     const { mean, gapFraction } = stepMeans(flight.imu, axis, line.time);
-    const extra = new Float64Array(n);
-    for (let from = 0; from < n;) { // one interval between measurements: the unknown acceleration is constant in a gap
+    // one interval between measurements: the unknown acceleration is constant in a gap
+    for (let from = 0; from < n;) {
       let to = from, gap = 0;
       do gap += gapFraction[to] * (line.time[to + 1] - line.time[to]); while (line.measurement[++to] < 0 && to < n);
-      const persistence = Math.max(gap / settings.dt, 1);
-      for (let i = from; i < to; i++) extra[i] = gapFraction[i] * persistence * axis.rms * axis.rms;
+      const persistence = Math.max(gap / settings.dt_s, 1);
+      for (let i = from; i < to; i++) extra[i] = gapFraction[i] * persistence * axis.rms ** 2;
       from = to;
     }
     return { mean, extra };
@@ -97,12 +93,13 @@ const Engine = (() => {
 
   /* Set row i of all columns */
   const write = (columns, i, values) => { for (const name in values) columns[name][i] = values[name]; };
-  /* Run KF (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
+  const processNoise = (settings, extra) => (settings.sigma_a_m_s2 * settings.sigma_a_m_s2 + extra) * settings.dt_s;
+  /* Run KF (px4fuse.replay); `settings` has the fields of px4fuse.Settings */
   function replay(flight, axis, settings) {
     const line = timeline(flight, axis, settings);
     if (line === null) return null;
     const { mean, extra } = inputs(flight, axis, settings, line);
-    const n = line.time.length, m = line.updates, R = settings.sigmaZ * settings.sigmaZ;
+    const n = line.time.length, m = line.updates, R = settings.sigma_z_m * settings.sigma_z_m;
     const columns = (names, length) => Object.fromEntries(names.split(" ").map((name) => [name, new Float64Array(length)]));
     const steps = { time: line.time, ...columns("p v p00 p01 p11", n), acceleration: mean, extra };
     const updates = columns("step time z nu s k0 k1 p v p00 p01 p11", m);
@@ -110,7 +107,7 @@ const Engine = (() => {
     write(steps, 0, { p, v, p00, p01, p11 });
     for (let i = 1; i < n; i++) {
       const dt = line.time[i] - line.time[i - 1], a = mean[i - 1];
-      const q = (settings.sigmaA * settings.sigmaA + extra[i - 1]) * settings.dt;
+      const q = processNoise(settings, extra[i - 1]);
       // x = Fx + Ba, P = FPFᵀ + Q
       p += v * dt + dt * dt / 2 * a;
       v += dt * a;
@@ -134,8 +131,8 @@ const Engine = (() => {
     return { steps, updates, settings };
   }
 
-  /* Position, velocity and position variance at other ascending times, NaN outside the KF run
-     (kalman.state_at and variance_at) */
+  // Position, velocity and position variance at other ascending times, NaN outside the KF run
+  // (kalman.state_at and variance_at)
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
     const position = new Float64Array(times.length), velocity = position.slice(), variance = position.slice();
@@ -147,7 +144,7 @@ const Engine = (() => {
       const ahead = t - time[j], a = j < n - 1 ? acceleration[j] : 0;
       position[i] = p[j] + v[j] * ahead + a * ahead * ahead / 2;
       velocity[i] = v[j] + a * ahead;
-      const q = (settings.sigmaA * settings.sigmaA + (s.extra[j] ?? 0)) * settings.dt;
+      const q = processNoise(settings, s.extra[j] ?? 0);
       variance[i] = s.p00[j] + 2 * ahead * s.p01[j] + ahead * ahead * s.p11[j] + q * ahead ** 3 / 4;
     }
     return { p: position, v: velocity, p00: variance };

@@ -4,12 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from bokeh.document import Document
-from bokeh.models import (
-    ColumnDataSource,
-    FactorRange,
-    HoverTool,
-    Range1d,
-)
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
@@ -21,25 +16,7 @@ BokehStyle = dict[str, Any]
 # Columns of the Bokeh data sources, filled by JavaScript: time, position, velocity and σ of both;
 # KF gains; position error and its ±2σ limits; plotted values x, y, z; arrow angle; event row, start
 # and end
-SOURCE_COLUMNS = (
-    "t",
-    "p",
-    "v",
-    "sp",
-    "sv",
-    "k0",
-    "k1",
-    "e",
-    "minus",
-    "plus",
-    "x",
-    "y",
-    "z",
-    "turn",
-    "row",
-    "left",
-    "right",
-)
+SOURCE_COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
 # JavaScript sets the colours by `name`. KF is solid and round, EKF2 dashed and square
 KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
@@ -73,7 +50,7 @@ LINE_STYLES = {
 }
 
 
-class Plot(Record, frozen=True):
+class Plot(Record):
     """Plot over time.
 
     Attributes
@@ -87,14 +64,14 @@ class Plot(Record, frozen=True):
     unit: str = ""
 
 
-class View(Record, frozen=True):
+class View(Record):
     """Tab of the page; ``plots`` are the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
 
 
-class Figures(Record, frozen=True):
+class Figures(Record):
     """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]
@@ -102,7 +79,7 @@ class Figures(Record, frozen=True):
     plots: dict[str, Plot]
 
 
-FIGURES = read_toml(__file__, "figures.toml", Figures)
+FIGURES = read_toml(__file__, Figures)
 
 
 def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
@@ -110,10 +87,7 @@ def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
     document = Document()
     time_range = _axis_range("time")
     plots = _make_plots(data, time_range)
-    plots |= {
-        "strip": _event_plot(data, time_range),
-        "step": _phase_plot(),
-    }
+    plots |= {"strip": _event_plot(data, time_range), "step": _phase_plot()}
     with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
@@ -231,7 +205,9 @@ def _axis_range(name: str | None = None) -> Range1d:
 
 
 def _empty_source(name: str) -> ColumnDataSource:
-    return ColumnDataSource({column: [] for column in SOURCE_COLUMNS}, name=f"{name}-source")
+    return ColumnDataSource(
+        {column: [] for column in SOURCE_COLUMNS.split()}, name=f"{name}-source"
+    )
 
 
 def _event_plot(data: PageData, time_range: Range1d) -> Any:
@@ -252,8 +228,7 @@ def _event_plot(data: PageData, time_range: Range1d) -> Any:
         right="right",
         height=0.55,
         source=source,
-        fill_color="#7d8894",
-        line_color="#7d8894",
+        color="#7d8894",
         name="event",
     )
     _add_cursor(plot_figure, name="cursor")
@@ -282,7 +257,6 @@ def _phase_plot() -> Any:
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
     _add_cursor(plot_figure, name="measurement", line_dash=[2, 2])
-    plot_figure.line("p", "v", source=_empty_source("trail-means"), name="measured")
     plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
     plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
     _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")

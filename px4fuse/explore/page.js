@@ -1,6 +1,7 @@
 /* Main script of the page: runs KF with the settings and draws plots and numbers. */
 const Explore = (async () => {
-  const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // maximum number of drawn points of a line, also while a slider is dragged
+  // maximum number of drawn points of a line, and while a slider is dragged
+  const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600;
   const read = (id) => $(`${id}${Practice.suffix}`).textContent;
   // ------------------------------------------------------------------ the flight's data
   const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
@@ -10,34 +11,34 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ settings
   // `log`: ends of a logarithmic slider; a slider without `log` is linear. `likely`: maximum-likelihood estimate
   const SETTINGS = [
-    { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
+    { id: "sigma-a", key: "sigma_a_m_s2", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise", likely: () => likelyNow()[0] },
-    { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
+    { id: "sigma-z", key: "sigma_z_m", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => likelyNow()[1] },
-    { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
+    { id: "clock-offset", key: "clock_offset_s", title: "Time offset", unit: "s",
       hint: "added to timestamps", likely: () => flight.offset.likely },
-    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
+    { id: "dt", key: "dt_s", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
-  const selected = { measurement: null }; // index of the measurement selected with the keys n and p, or null
+  // index of the measurement selected with the keys n and p, or null
+  const selected = { measurement: null };
   const round = (value, digits) => Number(value.toPrecision(digits));
-  const fixedReason = flight.offset.why; // set if the time offset cannot change
-  const offsetLimits = fixedReason ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
-  const limits = (setting) => setting.key === "offset" ? offsetLimits : ranges[setting.id];
+  // set if the time offset cannot change
+  const fixedReason = flight.offset.why;
+  const offsetLimits = fixedReason ? [settings.clock_offset_s, settings.clock_offset_s] : [flight.offset.from, flight.offset.to];
+  const limits = (setting) => setting.key === "clock_offset_s" ? offsetLimits : ranges.settings[setting.key];
   const isWithinLimits = (setting, text) => {
     const [low, high] = limits(setting);
     return text !== "" && text >= low && text <= high;
   };
   const fromSlider = (setting, tick) => {
-    if (!setting.log) return Math.round((offsetLimits[0] + (offsetLimits[1] - offsetLimits[0]) * tick / TICKS) * 1e4) / 1e4;
-    const [low, high] = setting.log.map(Math.log);
-    return round(Math.exp(low + (high - low) * tick / TICKS), 3);
+    const [low, high] = setting.log?.map(Math.log) ?? offsetLimits, value = low + (high - low) * tick / TICKS;
+    return setting.log ? round(Math.exp(value), 3) : Math.round(value * 1e4) / 1e4;
   };
   const toSlider = (setting, value) => {
-    const [low, high] = setting.log ? setting.log.map(Math.log) : offsetLimits;
-    const distance = (setting.log ? Math.log(value) : value) - low;
-    return Math.round(clamp(distance / (high - low || 1), 0, 1) * TICKS);
+    const [low, high, place] = setting.log ? [...setting.log, value].map(Math.log) : [...offsetLimits, value];
+    return Math.round(clamp((place - low) / (high - low || 1), 0, 1) * TICKS);
   };
   for (const setting of SETTINGS) {
     const box = make("div", "", "setting");
@@ -46,10 +47,9 @@ const Explore = (async () => {
     setting.number = make("input", "", { type: "number", id: `${setting.id}-value`, step: "any" });
     setting.slider = make("input", "", {
       type: "range", id: setting.id, min: 0, max: TICKS, step: 1, ariaLabel: setting.title });
-    setting.slider.setAttribute("list", `${setting.id}-likely`);
-    setting.tick = make("option");
-    const ticks = make("datalist", "", { id: `${setting.id}-likely` });
-    ticks.append(setting.tick);
+    const id = `${setting.id}-likely`, ticks = make("datalist", "", { id });
+    ticks.append(setting.tick = make("option"));
+    setting.slider.setAttribute("list", id);
     setting.slider.addEventListener("input", () => {
       set({ [setting.key]: fromSlider(setting, Number(setting.slider.value)) }, true);
     });
@@ -61,7 +61,7 @@ const Explore = (async () => {
       show();
     });
     box.append(label, setting.number, setting.slider, ticks);
-    if (setting.key === "offset" && fixedReason) box.append(make("p", fixedReason, "note"));
+    if (setting.key === "clock_offset_s" && fixedReason) box.append(make("p", fixedReason, "note"));
     $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
@@ -79,8 +79,8 @@ const Explore = (async () => {
       $("input-note").textContent = imu;
     }
   }
-  /* Mark the maximum-likelihood estimate on the track of a slider */
-  function markLikely(setting) {
+  /* Show the maximum-likelihood estimate in the label and on the track of a slider */
+  function showLikely(setting) {
     const value = setting.likely?.() ?? null;
     setting.tick.value = value === null ? "" : toSlider(setting, value);
     setting.estimate.textContent = value === null ? "" : `(maximum likelihood ${round(value, 3)})`;
@@ -90,17 +90,17 @@ const Explore = (async () => {
   const likelyNow = () => flight.likely[axisNow().noises] ?? [null, null];
 
   onClick("lesson", () => {
-    const { sigmaA, sigmaZ, dt } = ranges.lesson;
-    set({ sigmaA, sigmaZ, dt });
+    const { sigma_a_m_s2, sigma_z_m, dt_s } = ranges.lesson;
+    set({ sigma_a_m_s2, sigma_z_m, dt_s });
     showMessage("SIGMA_A, SIGMA_Z and DT are set to the values of the lesson UAT 366, module 2.");
   });
   onClick("likely", () => {
-    const [sigmaA, sigmaZ] = likelyNow();
-    set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
+    const [sigmaA, sigmaZ] = likelyNow().map((value) => round(value, 3));
+    set({ sigma_a_m_s2: sigmaA, sigma_z_m: sigmaZ, dt_s: flight.settings.dt_s });
     showMessage("SIGMA_A and SIGMA_Z are set to the maximum-likelihood estimates of this flight.");
   });
   onClick("ekf2-r", () => {
-    set({ sigmaZ: round(axisNow().ekf2.r, 3) });
+    set({ sigma_z_m: round(axisNow().ekf2.r, 3) });
     showMessage("SIGMA_Z is set to the median of √R of EKF2.");
   });
 
@@ -164,14 +164,11 @@ const Explore = (async () => {
     if (!models.has(name)) models.set(name, page.get_model_by_name(name));
     return models.get(name);
   };
-  const setSource = (name, columns) => { model(`${name}-source`).data = columns; };
+  const setSource = (name, data) => Object.assign(model(`${name}-source`) ?? {}, { data });
   /* Draw columns, reduced to a few thousand points, in each visible plot with this source */
   function drawSource(name, columns, keys) {
     const data = decimate(columns, keys);
-    for (const plot of PLOTS.filter(isVisible)) {
-      const source = model(`${plot}:${name}-source`);
-      if (source !== null) source.data = data;
-    }
+    for (const plot of PLOTS.filter(isVisible)) setSource(`${plot}:${name}`, data);
   }
   const timeRange = model("time");
   const figures = PLOTS.map(model);
@@ -181,11 +178,8 @@ const Explore = (async () => {
     const t = columns.t, n = t.length;
     const from = Math.max(t.findIndex((time) => time >= timeRange.start) - 1, 0);
     const last = t.findIndex((time) => time >= timeRange.end), to = last < 0 ? n : Math.min(last + 2, n);
-    const names = Object.keys(columns), out = {};
-    if (to - from <= pointLimit) {
-      for (const name of names) out[name] = columns[name].slice(from, to);
-      return out;
-    }
+    const mapColumns = (select) => Object.fromEntries(Object.entries(columns).map(([name, column]) => [name, select(column)]));
+    if (to - from <= pointLimit) return mapColumns((column) => column.slice(from, to));
     const bins = Math.floor(pointLimit / 2 / keys.length), indices = [];
     for (let b = 0; b < bins; b++) {
       const low = from + Math.floor((to - from) * b / bins);
@@ -198,12 +192,10 @@ const Explore = (async () => {
       }
       indices.push(...[...extremes].sort((a, b) => a - b));
     }
-    for (const name of names) out[name] = Float64Array.from(indices, (i) => columns[name][i]);
-    return out;
+    return mapColumns((column) => Float64Array.from(indices, (i) => column[i]));
   }
   const table = (names, columns) => Object.fromEntries(
     names.map((name, i) => [name, columns[i] ?? []]));
-  const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
   /* Draw arrow heads at the edge for innovations outside the plot */
   function drawOutsideArrows() {
@@ -212,10 +204,8 @@ const Explore = (async () => {
       const sources = names.map((name) => model(`innovation:${name}-source`)).filter(Boolean);
       const points = sources.flatMap(({ data: { t, x } }) => Array.from(t, (time, i) => [time, x[i]]));
       const out = points.filter(([, x]) => Math.abs(x) > end);
-      if (sources.length) {
-        setSource(`innovation:${arrows}`, { t: out.map(([t]) => t), y: out.map(([, x]) => 0.93 * end * Math.sign(x)),
-          turn: out.map(([, x]) => x > 0 ? 0 : Math.PI) });
-      }
+      setSource(`innovation:${arrows}`, { t: out.map(([t]) => t), y: out.map(([, x]) => 0.93 * end * Math.sign(x)),
+        turn: out.map(([, x]) => x > 0 ? 0 : Math.PI) });
     }
   }
 
@@ -282,14 +272,15 @@ const Explore = (async () => {
     }
     set({ ...flight.settings, ...changes });
   });
-  const isChanged = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
+  const isChanged = () => Object.keys(flight.settings).some((key) => settings[key] !== flight.settings[key]);
   const fixed = (key, unit) => (x) => x[key]?.toFixed(3).concat(unit);
+  const percent = ({ outside }, digits) => outside === undefined ? undefined : `${(100 * outside).toFixed(digits)} %`;
   const ROWS = [
     ["● innovation ÷ √S, RMS", (x) => x.source && Card.formatRatio(x.source)],
     ["◆ error ÷ σ, RMS", (x) => x.truth && Card.formatRatio(x.truth)],
-    ["Innovations outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined : `${(100 * x.outside).toFixed(1)} %`],
+    ["Innovations outside ±2√S (expected 5 %)", (x) => percent(x, 1)],
     ["Lag-1 autocorrelation of the innovations", (x) => x.lag1?.toFixed(2)],
-    ["Number of measurements", (x) => x.count && String(x.count)],
+    ["Number of measurements", (x) => x.count],
     ["KF − EKF2 position difference, RMS", fixed("ekf2P", " m")],
     ["KF − EKF2 velocity difference, RMS", fixed("ekf2V", " m/s")],
     ["Position RMSE", fixed("truthP", " m")],
@@ -325,7 +316,8 @@ const Explore = (async () => {
       sawtooth.sp[row] = Math.sqrt(p00[i]); sawtooth.sv[row++] = Math.sqrt(p11[i]);
     };
     for (let i = 0, u = 0; i < n; i++) {
-      if (u < m && updates.step[u] === i) add(i, updates, u++); // the state before the update is an additional row
+      // the state before the update is an additional row
+      if (u < m && updates.step[u] === i) add(i, updates, u++);
       add(i, steps, i);
     }
     const rows = { t: updates.time, x: updates.nu.map((nu, i) => nu / Math.sqrt(updates.s[i])),
@@ -333,10 +325,10 @@ const Explore = (async () => {
     drawSource("steps", sawtooth, ["p", "sp"]);
     drawSource("updates", rows, ["x"]);
     if (isVisible("position")) {
-      drawSource("measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
+      drawSource("measured", { t: axis.time.map((t) => t + settings.clock_offset_s), z: axis.z }, ["z"]);
     }
-    const expected = reference(axis, steps.time);
-    if (isVisible("error") && expected !== null) {
+    const expected = isVisible("error") ? reference(axis, steps.time) : null;
+    if (expected !== null) {
       const e = steps.p.map((p, i) => p - expected[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
       drawSource("error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
     }
@@ -356,8 +348,7 @@ const Explore = (async () => {
       const rows = table(["t", "nu", "sigma", "rejected"], innovations), { t } = rows;
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
-        drawSource(name, { t: Float64Array.from(which, (i) => t[i]),
-          x: Float64Array.from(which, (i) => rows.nu[i] / rows.sigma[i]) }, ["x"]);
+        drawSource(name, { t: which.map((i) => t[i]), x: which.map((i) => rows.nu[i] / rows.sigma[i]) }, ["x"]);
       }
     }
     if (!isText(axis.truth)) {
@@ -378,9 +369,9 @@ const Explore = (async () => {
     };
     const both = (format) => [["KF", kf], ["EKF2", ekf2Of(axis)]].flatMap(([name, values]) => {
       const text = values && format(values);
-      return text ? [`${name} ${text}`] : [];
+      return text ? `${name} ${text}` : [];
     }).join(", ");
-    title("innovation", `values outside ±2 (expected 5 %): ${both(({ outside }) => outside === undefined ? "" : `${(100 * outside).toFixed(0)} %`)}`);
+    title("innovation", `values outside ±2 (expected 5 %): ${both((x) => percent(x, 0))}`);
     title("gain", "solid: position gain, dotted: velocity gain (1/s)");
     if (kf === null) return;
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
@@ -396,16 +387,17 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ command
   function command() {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
-    const words = [settings.offset !== flight.settings.offset ? fixed : base];
+    const words = [settings.clock_offset_s !== flight.settings.clock_offset_s ? fixed : base];
     for (const setting of SETTINGS) {
-      const standard = setting.key !== "offset" ? lesson[setting.key] : fixedReason ? settings.offset : 0;
+      const standard = setting.key !== "clock_offset_s" ? lesson[setting.key] : fixedReason ? settings.clock_offset_s : 0;
       if (settings[setting.key] !== standard) words.push(`--${setting.id} ${round(settings[setting.key], 12)}`);
     }
     if (settings.input !== defaultInput || input !== null) words.push(`--input ${settings.input}`);
     return words.join(" ");
   }
   // ------------------------------------------------------------------ whole page
-  let axisShown = null; // null: to be drawn
+  // null: to be drawn
+  let axisShown = null;
   /* Run KF and draw the visible views; `quick`, during a drag of a slider: without texts and tables */
   function show(quick = false) {
     cancelAnimationFrame(nextFrame);
@@ -422,7 +414,7 @@ const Explore = (async () => {
     if (isNewAxis) {
       drawReferences(result.axis);
       card.showAxis(settings.axis, flight.main);
-      SETTINGS.forEach(markLikely);
+      SETTINGS.forEach(showLikely);
     }
     if (result.run) drawKf(result);
     drawCard(result);

@@ -24,8 +24,8 @@ def html_text(analysis: Analysis) -> str:
     data, card = flight_data(analysis, packer), card_of(analysis)
     identity = card.identity
     return page_text(
-        data_scripts(data, analysis, packer),
         data,
+        data_scripts=data_scripts(data, analysis, packer),
         command="explore",
         title=data["log"],
         about=f"{identity.source}, {identity.firmware}, {identity.duration_s:.1f} s",
@@ -50,31 +50,24 @@ def data_scripts(data: PageData, analysis: Analysis, packer: Packer, suffix: str
 
 
 def page_text(
-    data_elements: str,
     data: PageData,
     *,
     command: str,
-    title: str,
-    about: str = "",
-    card: str = "",
     sha256: str = "",
-    flight_count: int = 0,
     choices: Mapping[str, str] = {},
+    **fields: object,
 ) -> str:
     """Make the HTML page of one flight, or of a practice set.
 
     Parameters
     ----------
-    data_elements : str
-        Result of :func:`data_scripts` for each flight.
     data : dict
         Data of one of the flights.
-    about : str
-        Description of the flight in the header.
-    card : str
-        Diagnosis card (HTML); empty for a practice set.
     choices : mapping
         Answers of a practice set and their texts.
+    fields
+        Fields of ``page.html``: title, description ("about"), elements with the data of each flight
+        (:func:`data_scripts`), and the diagnosis card (HTML) or the number of flights.
     """
     practice = "practice" if choices else "no_practice"
     scripts_by_name = {
@@ -92,14 +85,10 @@ def page_text(
         + card_style()
         + read_asset("page.css", PACKAGE),
         command=command,
-        title=title,
-        about=about,
-        card=card,
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
-        data=data_elements,
-        flight_count=flight_count,
         choices=choices,
         views=FIGURES.views,
         has_reference=has_reference(data),
+        **fields,
     )

@@ -1,5 +1,5 @@
-/* Practice: current flight, answers of the student and score. The page address contains them, so a reload keeps them.
-   The solution of a flight is decoded only after the student's answer. */
+// Practice: current flight, answers of the student and score. The page address contains them, so a reload keeps them.
+// The solution of a flight is decoded only after the student's answer.
 const Practice = (() => {
   const count = Number($("quiz").dataset.flights), address = new URLSearchParams(location.hash.slice(1));
   const savedAnswers = (address.get("answers") ?? "").split("~").slice(0, count);
@@ -76,8 +76,10 @@ const Practice = (() => {
       box.append(make("p", `${fault}: ${size}, ${time}. ${symptom}`), button);
     }
     box.hidden = false;
-    $("card").innerHTML = solution.card; // px4fuse has escaped its texts
-    for (const button of queryAll("[data-apply]")) { // without the log file in the command
+    // px4fuse has escaped its texts
+    $("card").innerHTML = solution.card;
+    // without the log file in the command
+    for (const button of queryAll("[data-apply]")) {
       button.previousElementSibling.textContent = button.dataset.apply.replace(/^.*? (?=--)/, "");
     }
     page.open(solution.mistakes[0]?.view ?? "errors");

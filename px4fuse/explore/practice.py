@@ -17,6 +17,7 @@ from msgspec import structs
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
 from px4fuse.core.record import Record, read_toml
+from px4fuse.core.text import capitalise_first
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
@@ -61,7 +62,7 @@ FINDING_WITH_TIME_BY_MISTAKE = {
 NOISY_UWB = "noisy-uwb"
 
 
-class HiddenMistake(Record, frozen=True):
+class HiddenMistake(Record):
     """Injected fault in a practice flight.
 
     Attributes
@@ -86,14 +87,14 @@ class HiddenMistake(Record, frozen=True):
     has_either_sign: bool = False
 
 
-class MistakeTable(Record, frozen=True):
+class MistakeTable(Record):
     """Answers of the quiz with their texts, and the injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
 
 
-_QUIZ = read_toml(__file__, "practice.toml", MistakeTable)
+_QUIZ = read_toml(__file__, MistakeTable)
 FAULT_CHOICES, HIDDEN_MISTAKES = _QUIZ.choices, _QUIZ.mistakes
 
 
@@ -110,7 +111,7 @@ class PracticeFlight:
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
-def draw_flights(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
+def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...]:
     """Draw random practice flights, in which all faults are equally frequent.
 
     Parameters
@@ -155,8 +156,8 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
 
 def practice_text(
     seed: int,
-    level: int = 1,
-    count: int = 10,
+    level: int,
+    count: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
     """Simulate the flights of :func:`draw_flights`, and return the practice page (HTML).
@@ -170,8 +171,8 @@ def practice_text(
         data, data_element = _flight_data(practice_flight, number)
         data_elements.append(data_element)
     return page_text(
-        "\n".join(data_elements),
         data,
+        data_scripts="\n".join(data_elements),
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -239,6 +240,6 @@ def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Car
     return structs.replace(
         card,
         severity="warning",
-        headline=fault_text[0].upper() + fault_text[1:],
+        headline=capitalise_first(fault_text),
         do_this=("None of the automatic checks finds this fault. Compare the plots.",),
     )

@@ -1,9 +1,9 @@
-/* Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
-   the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers. */
+// Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
+// the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers.
 const Step = (() => {
   const CORNERS = 120;
-  const TRAIL = 60; // number of previous KF steps whose positions and velocities are drawn
-  const STEP_TIME_MS = 400; // duration of a prediction or update in the animation
+  // duration of a prediction or update in the animation
+  const STEP_TIME_MS = 400;
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
@@ -19,19 +19,16 @@ const Step = (() => {
 
   /* All predictions and updates of a KF run in order: `i` is the index of the step, `u` of the measurement or -1 */
   function moments({ steps, updates }) {
-    const list = [{ i: 0, u: -1, updated: false }];
-    for (let i = 1, u = 0; i < steps.time.length; i++) {
-      const updateIndex = u < updates.step.length && updates.step[u] === i ? u++ : -1;
+    const list = [];
+    for (let i = 0, u = 0; i < steps.time.length; i++) {
+      const updateIndex = updates.step[u] === i ? u++ : -1;
       list.push({ i, u: updateIndex, updated: false });
       if (updateIndex >= 0) list.push({ i, u: updateIndex, updated: true });
     }
     return list;
   }
-  const stateAfter = ({ steps: s }, i) => [s.p[i], s.v[i], s.p00[i], s.p01[i], s.p11[i]];
-  function state(run, { i, u, updated }) {
-    const { updates: s } = run;
-    return u >= 0 && !updated ? [s.p[u], s.v[u], s.p00[u], s.p01[u], s.p11[u]] : stateAfter(run, i);
-  }
+  const stateOf = (s, i) => [s.p[i], s.v[i], s.p00[i], s.p01[i], s.p11[i]];
+  const state = ({ steps, updates }, { i, u, updated }) => u >= 0 && !updated ? stateOf(updates, u) : stateOf(steps, i);
 
   const format = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
   const matrix = (a, b, d) => `[${format(a, 5)}  ${format(b, 5)}; ${format(b, 5)}  ${format(d, 5)}]`;
@@ -41,9 +38,9 @@ const Step = (() => {
   /* Equations with numbers: rows [title, text] of prediction and update */
   function equations(run, settings, moment) {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
-    const [, , b00, b01, b11] = stateAfter(run, i - 1), prior = state(run, { i, u, updated: false });
-    const [p, v, p00, p01, p11] = prior, dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
-    const q = (settings.sigmaA ** 2 + s.extra[i - 1]) * settings.dt;
+    const [, , b00, b01, b11] = stateOf(s, i - 1), [p, v, p00, p01, p11] = state(run, { i, u, updated: false });
+    const dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
+    const q = (settings.sigma_a_m_s2 ** 2 + s.extra[i - 1]) * settings.dt_s;
     const prediction = [
       ["Previous state", `x⁺ = [${format(s.p[i - 1])} m, ${format(s.v[i - 1])} m/s]`],
       ["", `P⁺ = ${matrix(b00, b01, b11)}`],
@@ -55,11 +52,11 @@ const Step = (() => {
     ];
     if (u < 0) return [prediction, []];
     const update = [
-      ["Measurement", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(settings.sigmaZ ** 2, 5)} m²`],
+      ["Measurement", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(settings.sigma_z_m ** 2, 5)} m²`],
       ["Innovation", `ν = z − Hx⁻ = ${format(m.nu[u])} m`],
       ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`]];
     if (updated) {
-      const [x, w, c00, c01, c11] = stateAfter(run, i);
+      const [x, w, c00, c01, c11] = stateOf(s, i);
       update.push(
         ["Gain", `K = P⁻Hᵀ/S = [${format(m.k0[u])}, ${format(m.k1[u])} 1/s]`],
         ["Update", `x⁺ = x⁻ + Kν = [${format(x)} m, ${format(w)} m/s]`],
@@ -77,7 +74,8 @@ const Step = (() => {
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null; // index of a prediction or update in listNow(), and timer of the animation
+    // index of a prediction or update in listNow(), and timer of the animation
+    let moment = null, playing = null;
 
     /* Show KF after the update with a measurement (index) */
     function goTo(measurement) {
@@ -110,11 +108,13 @@ const Step = (() => {
       if (moment === null || moment >= list.length - 1) moment = 0;
       playing = setInterval(advance, STEP_TIME_MS);
       $("play").textContent = "Pause";
-      $("now").ariaLive = "off"; // too fast for a screen reader
+      // too fast for a screen reader
+      $("now").ariaLive = "off";
     }
     function draw() {
       const { run } = result;
-      if (isVisible("step")) selected.measurement ??= 0; // the view opens at the first update
+      // the view opens at the first update
+      if (isVisible("step")) selected.measurement ??= 0;
       if (moment === null && selected.measurement !== null) {
         const requested = Math.min(selected.measurement, (run?.updates.nu.length ?? 1) - 1);
         moment = listNow().findIndex(({ u, updated }) => updated && u === requested);
@@ -151,17 +151,15 @@ const Step = (() => {
     }
     function drawPlane(run, current) {
       const plot = model("step"), now = state(run, current);
-      const previous = current.updated ? state(run, { ...current, updated: false }) : stateAfter(run, Math.max(current.i - 1, 0));
+      const previous = current.updated ? state(run, { ...current, updated: false }) : stateOf(run.steps, Math.max(current.i - 1, 0));
       setSource("now", ellipse(now));
       setSource("before", ellipse(previous));
       setSource("mean", { p: [now[0]], v: [now[1]] });
-      const from = Math.max(current.i - TRAIL, 0);
-      setSource("trail-means", { p: run.steps.p.subarray(from, current.i), v: run.steps.v.subarray(from, current.i) });
       const isMeasured = current.u >= 0, z = run.updates.z[current.u];
       const [band, line] = ["band", "measurement"].map((name) => plot.center.find((item) => item.name === name));
       band.visible = line.visible = isMeasured;
       if (isMeasured) {
-        [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
+        [band.left, band.right] = [z - 2 * settings.sigma_z_m, z + 2 * settings.sigma_z_m];
         line.location = z;
       }
       // the same scale for the whole run shows changes of the ellipse; only the first ellipses are larger
@@ -174,7 +172,8 @@ const Step = (() => {
       next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play };
     for (const [id, act] of Object.entries(actions)) onClick(id, act);
     $("cursor").addEventListener("input", (event) => goTo(Number(event.target.value)));
-    const restart = () => { // a new KF run has other steps but the same measurements
+    // a new KF run has other steps but the same measurements
+    const restart = () => {
       moment = null;
       draw();
     };

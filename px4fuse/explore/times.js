@@ -26,16 +26,14 @@ const Times = (() => {
     [timeRange.start, timeRange.end] = ends;
     timeRange.properties.start.change.connect(onRangeChange);
     timeRange.properties.end.change.connect(onRangeChange);
-    const move = (by) => {
-      const width = timeRange.end - timeRange.start;
-      setSpan(timeRange.start + by * width, timeRange.end + by * width);
+    /* Show a time range with its middle at time t (s), wider by a factor */
+    const showAround = (t, factor = 1) => {
+      const half = factor * (timeRange.end - timeRange.start) / 2;
+      setSpan(t - half, t + half);
     };
-    const zoom = (by) => {
-      const middle = (timeRange.start + timeRange.end) / 2, half = by * (timeRange.end - timeRange.start) / 2;
-      setSpan(middle - half, middle + half);
-    };
-    const actions = { earlier: () => move(-0.5), later: () => move(0.5), closer: () => zoom(0.5),
-      wider: () => zoom(2), whole: () => setSpan(...ends) };
+    const middle = () => (timeRange.start + timeRange.end) / 2;
+    const actions = { earlier: () => showAround(timeRange.start), later: () => showAround(timeRange.end),
+      closer: () => showAround(middle(), 0.5), wider: () => showAround(middle(), 2), whole: () => setSpan(...ends) };
     for (const [id, act] of Object.entries(actions)) onClick(id, act);
     const keys = { ArrowLeft: actions.earlier, ArrowRight: actions.later, "+": actions.closer,
       "-": actions.wider, 0: actions.whole, ...otherKeys };
@@ -49,32 +47,24 @@ const Times = (() => {
 
     // ------------------------------------------------------------------ events
     function drawEvents(axis) {
-      const rows = { row: [], left: [], right: [] };
-      const add = (row, low, high) => {
-        rows.row.push(row); rows.left.push(low); rows.right.push(high);
-      };
       const { events } = flight, minWidth = (ends[1] - ends[0]) / 800;
-      for (const [row, spans] of [["on the ground", events.ground], ["gap in source", events.gap], ["log dropout", events.dropout]]) {
-        for (const [low, high] of spans) add(row, low, high);
-      }
+      const spans = { "on the ground": events.ground, "gap in source": events.gap, "log dropout": events.dropout };
       if (!isText(axis.ekf2)) {
-        const [time, , , rejected] = axis.ekf2.innovations;
-        for (const [row, times] of [["EKF2 reset", events.reset], ["EKF2 rejected", time?.filter((_, i) => rejected[i]) ?? []]]) {
-          for (const t of times) add(row, t, t + minWidth);
-        }
+        const [time = [], , , rejected] = axis.ekf2.innovations, widen = (t) => [t, t + minWidth];
+        spans["EKF2 reset"] = events.reset.map(widen);
+        spans["EKF2 rejected"] = [...time].filter((_, i) => rejected[i]).map(widen);
       }
-      setSource("strip", rows);
+      const rows = Object.entries(spans).flatMap(([row, list]) => list.map((span) => [row, ...span]));
+      const [row, left, right] = [0, 1, 2].map((column) => rows.map((cells) => cells[column]));
+      setSource("strip", { row, left, right });
     }
 
     /* Make time t (s) visible in the plots */
     function showTime(t) {
-      if (t >= timeRange.start && t <= timeRange.end) return;
-      const half = (timeRange.end - timeRange.start) / 2;
-      setSpan(t - half, t + half);
+      if (t < timeRange.start || t > timeRange.end) showAround(t);
     }
 
     // ------------------------------------------------------------------ colours
-    const dark = matchMedia("(prefers-color-scheme: dark)");
     function paint() {
       const style = getComputedStyle(document.documentElement);
       const colours = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`)]));
@@ -90,13 +80,16 @@ const Times = (() => {
     function colour(name, glyph, colours) {
       if (name === "kf_band") { glyph.fill_color = colours.kf; return; }
       if (name === null || colours[name] === undefined) return;
-      const hasColour = (property) => Boolean(property?.value === undefined ? property : property.value);
-      if (hasColour(glyph.line_color)) glyph.line_color = colours[name];
-      if (hasColour(glyph.fill_color)) glyph.fill_color = colours[name]; // hollow marks have none
+      for (const property of ["line_color", "fill_color"]) {
+        const value = glyph[property];
+        // hollow marks have no fill colour
+        if (value?.value === undefined ? value : value.value) glyph[property] = colours[name];
+      }
     }
-    dark.addEventListener("change", paint);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
     paint();
-    if (matchMedia("(pointer: coarse)").matches) { // a finger scrolls the page, so only buttons zoom
+    // a finger scrolls the page, so only buttons zoom
+    if (matchMedia("(pointer: coarse)").matches) {
       for (const plot of figures) plot.toolbar.active_drag = null;
     }
     showRange();

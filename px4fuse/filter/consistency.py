@@ -41,7 +41,7 @@ CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth
 DEFAULT_GATE = 5.0
 
 
-class NisVerdict(Record, frozen=True, kw_only=True):
+class NisVerdict(Record, kw_only=True):
     """Mean NIS with its 95 % band, and the verdict on the reported σ.
 
     Attributes
@@ -66,7 +66,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
-class Consistency(NisVerdict, frozen=True, kw_only=True):
+class Consistency(NisVerdict, kw_only=True):
     """Statistics of a filter's innovations ν, compared with the innovation variances S.
 
     Attributes
@@ -95,7 +95,7 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
     ljung_box_lags: Count
 
 
-class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
+class HorizontalNis(NisVerdict, kw_only=True):
     """NIS of north and east together (two degrees of freedom), divided by two.
 
     The covariance between north and east is omitted, because EKF2 does not log it.

@@ -67,7 +67,7 @@ MIN_POSITION_SCALE = 0.1
 HEADING_ERROR_INDEX = 2
 
 
-class HeadingPart(Record, frozen=True):
+class HeadingPart(Record):
     """Yaw misalignment in one part of the flight."""
 
     start_s: float
@@ -76,7 +76,7 @@ class HeadingPart(Record, frozen=True):
     sigma_deg: NotNegative
 
 
-class HeadingError(Record, frozen=True):
+class HeadingError(Record):
     """Misalignment in yaw between the source's frame and the logged attitude.
 
     Attributes

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis

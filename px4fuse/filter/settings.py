@@ -17,19 +17,22 @@ INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting; a value outside is probably a typo."""
+    """Valid range of a numeric setting with unit and name in texts; a value outside is a typo."""
 
     low: float
     high: float
     unit: str
+    label: str
 
 
 SETTING_RANGES = {
-    "sigma_a_m_s2": Range(1e-4, 100.0, "m/s²"),
-    "sigma_z_m": Range(1e-4, 100.0, "m"),
-    "dt_s": Range(1e-3, 1.0, "s"),
-    "clock_offset_s": Range(-10.0, 10.0, "s"),
+    "sigma_a_m_s2": Range(1e-4, 100.0, "m/s²", "SIGMA_A"),
+    "sigma_z_m": Range(1e-4, 100.0, "m", "SIGMA_Z"),
+    "dt_s": Range(1e-3, 1.0, "s", "DT"),
+    "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source"),
 }
+# Numeric settings of KF itself: the time offset belongs to the position source
+KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit) in SETTING_RANGES.items():
+        for name, (low, high, unit, _) in SETTING_RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:  # also True for NaN
                 raise SettingsError(

@@ -16,8 +16,7 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Span
+from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 

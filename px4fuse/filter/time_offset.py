@@ -57,7 +57,7 @@ MIN_OFFSET_S = 0.03
 SIMULATION_COUNT = 96
 
 
-class PartOffset(Record, frozen=True):
+class PartOffset(Record):
     """Time offset in one part of the flight."""
 
     start_s: float
@@ -66,7 +66,7 @@ class PartOffset(Record, frozen=True):
     sigma_s: NotNegative
 
 
-class ClockOffset(Record, frozen=True, kw_only=True):
+class ClockOffset(Record, kw_only=True):
     """Time offset to add to the logged timestamps of the position source.
 
     Attributes

@@ -50,7 +50,7 @@ START_RANDOM_WALK_M = 0.02
 MAX_SEARCH_END_RATIO = 1.001
 
 
-class Noise(Record, frozen=True):
+class Noise(Record):
     """Maximum-likelihood estimate of one noise parameter, with its 95 % interval.
 
     ``value`` is None if the maximum is outside the search range, ``low`` if the noise may be zero,
@@ -74,7 +74,7 @@ class Noise(Record, frozen=True):
         return {name: self.value, f"{name}_interval": interval}
 
 
-class HeldOutCheck(Record, frozen=True):
+class HeldOutCheck(Record):
     """Noises estimated from the first half of the flight and tested with the second half.
 
     Attributes
@@ -91,7 +91,7 @@ class HeldOutCheck(Record, frozen=True):
     log_likelihood_gain_per_measurement: float
 
 
-class AxisTuning(Record, frozen=True, kw_only=True):
+class AxisTuning(Record, kw_only=True):
     """Estimated noises of one axis, or of north and east together, with 95 % intervals.
 
     For missing values see :class:`Noise`; ``low`` = None is stored as 0.

@@ -41,7 +41,7 @@ ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
 # Ids of the findings that each finding causes, one per line
-CONSEQUENCES: Mapping[str, str] = read_toml(__file__, "consequences.toml", dict[str, str])
+CONSEQUENCES: Mapping[str, str] = read_toml(__file__, dict[str, str], "consequences.toml")
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:

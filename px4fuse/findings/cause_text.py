@@ -105,7 +105,7 @@ def format_shift(shift_s: float) -> str:
 def format_kf_settings(settings: Mapping[str, float]) -> str:
     """Format the action "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
     setting_texts = (
-        f"{name[:7].upper()} to {value:g} {SETTING_RANGES[name].unit} "
+        f"{SETTING_RANGES[name].label} to {value:g} {SETTING_RANGES[name].unit} "
         f"({COMPARISON_OPTIONS[name]} {value:g})"
         for name, value in sorted(settings.items())
     )
@@ -136,7 +136,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
                 else f"positions rotated by {value:+.0f}°{average_text}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
-            label, unit = name[:7].upper(), SETTING_RANGES[name].unit
+            unit, label = SETTING_RANGES[name][2:]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
@@ -22,8 +22,14 @@ from px4fuse.findings.model import (
     spans_with_value,
     warning,
 )
-from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_phrase
-from px4fuse.flight.position_source import POSITION_FILE
+from px4fuse.flight.model import (
+    POSITION_FILE,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    positions_phrase,
+)
 
 # Fraction of the time with fusion of the source by EKF2, below which the severity is error
 MIN_FUSED_FRACTION_ERROR = 0.5
@@ -44,7 +50,7 @@ def detect(analysis: Comparison) -> Findings:
     yield from detect_missing_fusion(analysis)
 
 
-def detect_missing_fusion(analysis: Comparison) -> Findings:
+def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
@@ -106,7 +112,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
         )
 
 
-def _received_source(analysis: Comparison) -> PositionTrack | None:
+def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
     """Return the positions that PX4 received; a position file did not reach PX4."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
@@ -156,7 +162,9 @@ def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...
     return float(np.hypot(*distances_m).max())
 
 
-def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusion_flag: pd.Series) -> Findings:
+def _detect_slow_restart(
+    analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
+) -> Findings:
     """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
     source = analysis.source
     if (

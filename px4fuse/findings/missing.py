@@ -1,11 +1,10 @@
 """Data missing from the log: EKF2, acceleration, innovations, or positions that PX4 received."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import Unavailable, positions_phrase
-from px4fuse.flight.position_source import RECEIVED
+from px4fuse.flight.model import RECEIVED, Unavailable, positions_phrase
 
 RECEIVED_TOPIC = "vehicle_visual_odometry"
 # Bits 0 and 7 of SDLOG_PROFILE: default topics, and external vision (logged_topics.cpp)
@@ -19,7 +18,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_unavailable_data(analysis: Analysis) -> Findings:
     """Detect a missing EKF2 state, a missing acceleration, and too few innovations."""
-    ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
+    ekf2, acceleration = analysis.flight.ekf2, analysis.input_axes[0].acceleration
     if isinstance(ekf2, Unavailable):
         reason = capitalise_first(ekf2.reason)
         message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
@@ -43,7 +42,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
             return
 
 
-def detect_source_not_logged(analysis: Comparison) -> Findings:
+def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect a log without the positions as PX4 received them."""
     source, received_preference = analysis.source, RECEIVED.preference_rank
     has_received_positions = any(

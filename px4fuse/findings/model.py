@@ -13,11 +13,10 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionTrack
-from px4fuse.flight.position_source import PositionKind
+from px4fuse.flight.model import PositionKind, PositionTrack
 
 
-class CatalogueEntry(Record, frozen=True):
+class CatalogueEntry(Record):
     """Texts of a finding, and its place among other findings.
 
     Attributes
@@ -48,13 +47,13 @@ class CatalogueEntry(Record, frozen=True):
 
 # All findings by id; findings of equal severity are listed in this order
 CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
-    __file__, "catalogue.toml", dict[str, CatalogueEntry]
+    __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
 
 
-class Example(Record, frozen=True):
+class Example(Record):
     """Example of a finding, with its false alarms and detection rates (tests/studies/rates.csv).
 
     Attributes
@@ -80,7 +79,7 @@ def load_examples() -> Mapping[str, Example]:
     )
 
 
-class SourceWords(Record, frozen=True):
+class SourceWords(Record):
     """Causes and actions of findings about the position source, for one kind of source."""
 
     smoothing_action: str
@@ -93,7 +92,7 @@ class SourceWords(Record, frozen=True):
     errors: str
 
 
-_WORDS_BY_KIND = read_toml(__file__, "source_words.toml", dict[PositionKind, dict[str, str]])
+_WORDS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
 SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
     kind: SourceWords(**(_WORDS_BY_KIND["unknown"] | words))
     for kind, words in _WORDS_BY_KIND.items()

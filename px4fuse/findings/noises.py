@@ -176,7 +176,7 @@ def _setting_finding(
 
 
 def format_estimate(name: str, setting: float, noise: Noise) -> str:
-    label, unit = name[:7].upper(), SETTING_RANGES[name].unit
+    unit, label = SETTING_RANGES[name][2:]
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
     if noise.value is not None and noise.high:

@@ -3,7 +3,7 @@
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.findings.model import Findings, finding, format_count, note, warning
@@ -17,7 +17,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_other_estimators(analysis)
 
 
-def detect_dropouts(analysis: Comparison) -> Findings:
+def detect_dropouts(analysis: PreparedComparison) -> Findings:
     """Detect logger dropouts in the segment."""
     segment = analysis.segment
     dropouts = [

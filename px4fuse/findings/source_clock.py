@@ -4,7 +4,7 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.model import Comparison, FilterName
+from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.trials import Trial
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.cause_text import format_shift
@@ -123,7 +123,7 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
     return f"{shift_text} the timestamp (usec) of each position{delay_action}."
 
 
-def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
+def clock_offset_option_s(comparison: PreparedComparison, clock: ClockOffset) -> float:
     """Return the value (s) for ``--clock-offset``."""
     # the option replaces the time offset that the alignment of a position file applied
     alignment = comparison.source.alignment

@@ -16,8 +16,7 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, finding, format_percent, note, source_words, warning
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import Ekf2, Unavailable, positions_phrase, step_values_at
-from px4fuse.flight.position_source import ALIGNED
+from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %

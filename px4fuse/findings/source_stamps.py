@@ -8,8 +8,15 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP_ACTION, STAMP_FAULTS, SYNCHRONISE_ACTION
 from px4fuse.findings.model import Findings, error, fraction_of_ones, note, warning
-from px4fuse.flight.log import REPEATED_TIMESTAMPS, ClockMap
-from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_phrase
+from px4fuse.flight.model import (
+    ARRIVAL_METHODS,
+    REPEATED_TIMESTAMPS,
+    ClockMap,
+    Ekf2,
+    FusionRecord,
+    Unavailable,
+    positions_phrase,
+)
 
 # Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010

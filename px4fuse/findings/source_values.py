@@ -14,7 +14,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_settings
-from px4fuse.ekf2.replay import inside_spans
+from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, source_words, warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
@@ -122,7 +122,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
     """Return the times of the last valid measurement before a span and the first one after it."""
-    time_s = analysis.lines[0].measurement_time_s
+    time_s = analysis.input_axes[0].measurement_time_s
     indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
 
@@ -198,7 +198,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
         return ""
     rmses_m = []
     for replay in (model.baseline_replay, *replay_settings(model, [change])):
-        replayed_track = replay.published[inside_spans(replay.published.index, replay.evaluated_s)]
+        replayed_track = rows_inside(replay.published, replay.evaluated_s)
         axis_errors_m = [
             replayed_track[name]
             - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])

@@ -42,13 +42,14 @@ class Aid:
     default_gate: float = 5.0
     # Axes of the innovations, in the order of PX4
     axes: tuple[str, ...] = ()
-    # Fields of the topics estimator_innovations and estimator_innovation_variances, by axis
-    fields: tuple[str, ...] = ()
+    # Fields of the topics estimator_innovations and estimator_innovation_variances, by axis, as in
+    # readers/field_maps.py
+    fields: str = ""
     # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
-    old_fields: tuple[str, ...] = ()
-    # Groups of flags in estimator_status_flags. In the first group that the log contains, any flag
-    # shows that EKF2 is configured to fuse this source
-    flags: tuple[tuple[str, ...], ...] = ()
+    old_fields: str = ""
+    # Groups of flags in estimator_status_flags, separated by commas. In the first group that the
+    # log contains, any flag shows that EKF2 is configured to fuse this source
+    flags: tuple[str, ...] = ()
     # Bit of estimator_status.control_mode_flags with the same meaning as ``flags``
     status_bit: int | None = None
 
@@ -95,13 +96,14 @@ class Parameter(NamedTuple):
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-PARAMETER_TABLES = read_toml(__file__, "ekf2_parameters.toml", dict)
+PARAMETER_TABLES = read_toml(__file__, dict)
 # Keys of PARAMETER_TABLES whose text contains several names, separated by blanks
-NAME_LIST_KEYS = ("axes", "fields", "old_fields", "lever_arm")
+NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
 AIDS, DISTURBANCES = (
     {
         name: msgspec.convert(
-            {"name": name, **row} | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
+            {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
+            | {key: row[key].split() for key in NAME_LIST_KEYS if key in row},
             Aid,
         )
         for name, row in rows.items()
@@ -112,9 +114,15 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     AIDS.__getitem__,
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
-PARAMETERS = msgspec.convert(PARAMETER_TABLES["parameters"], dict[str, Parameter])
+PARAMETERS, _LOGGED_PARAMETERS = (
+    msgspec.convert(
+        {name: row for names, row in PARAMETER_TABLES[table].items() for name in names.split()},
+        dict[str, Parameter],
+    )
+    for table in ("parameters", "logged")
+)
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
-PARAMETER_RANGES = PARAMETERS | msgspec.convert(PARAMETER_TABLES["logged"], dict[str, Parameter])
+PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
 FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5

@@ -15,17 +15,273 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
+import msgspec
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import NotNegative, Record, Span, Vector
+from px4fuse.core.record import (
+    Count,
+    NotNegative,
+    Record,
+    Sha256,
+    Share,
+    Span,
+    Vector,
+    one_line_repr,
+)
 from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
-from px4fuse.flight.ekf2_parameters import BAROMETER, Aid
-from px4fuse.flight.log import ClockMap, InputFile, LogInfo, Stream, UnusedData
-from px4fuse.flight.position_source import Origin, PositionKind
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS, Aid
+
+PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
+DataPath = Literal[
+    "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
+]
+
+
+class Origin(Record):
+    """Kind of a position source, and the path of its positions from the sender to the log."""
+
+    # "vio" is any source with a changing orientation, "uwb" a noisy one without orientation, and
+    # "unknown" another one without orientation (kind_without_orientation)
+    kind: PositionKind
+    path: DataPath
+    # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
+    aid: Aid | None
+    # True if px4fuse may select the source without --position-source
+    is_automatic: bool = True
+
+    @property
+    def may_drift(self) -> bool:
+        """True if the position error may grow with the distance travelled, as for odometry.
+
+        A log does not distinguish odometry from motion capture sent in the same messages, so both
+        may drift.
+        """
+        return self.kind == "vio"
+
+    @property
+    def reconstructed(self) -> bool:
+        """True if the positions are derived from EKF2's logged data, not logged as received."""
+        return self.path in ("kept by EKF2", "rebuilt from innovations")
+
+    @property
+    def has_all_samples(self) -> bool:
+        """True if the position track contains all samples of the sender."""
+        return self.path in ("given file", "as received")
+
+    @property
+    def is_vision(self) -> bool:
+        return self.aid == EV_POS
+
+    @property
+    def fused_as_gnss(self) -> bool:
+        return self.aid == GNSS_POS
+
+    @property
+    def is_gnss(self) -> bool:
+        """True for GNSS.
+
+        Multipath and atmospheric errors are correlated over minutes, so R must be larger than the
+        variance of the differences of consecutive positions.
+        """
+        return self.kind == "gnss"
+
+    @property
+    def preference_rank(self) -> int:
+        """Index of this origin in :data:`ORIGINS`; a smaller index is preferred."""
+        return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
+
+
+POSITION_FILE = Origin("file", "given file", EV_POS)
+RECEIVED = Origin("uwb", "as received", EV_POS)
+MOTION_CAPTURE = Origin("mocap", "as received", None)
+ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
+LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
+GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
+# All origins in order of preference
+ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
+
+
+def find_origin(kind: str, path: str) -> Origin:
+    for origin in ORIGINS:
+        if (origin.kind, origin.path) == (kind, path):
+            return origin
+    raise ValueError(f"ORIGINS in {__file__} has no kind and path {(kind, path)}")
+
+
+def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
+    """Change the kind "uwb" to "vio" if the source sends a changing orientation."""
+    return replace(origin, kind="vio") if origin.kind == "uwb" and is_changing else origin
+
+
+REPEATED_TIMESTAMPS = "most timestamps are repeated"
+# Name of the clock of a sender in a ULog: PX4 converts or replaces the sender's timestamps
+SENDER_CLOCK = "sender timestamps"
+# Replacement for the estimates, re-runs and findings of a flight that is a student assignment
+DIAGNOSIS_WITHHELD = Unavailable(
+    "diagnosis",
+    "the flight is an assignment, so px4fuse withholds its diagnosis",
+    "Analyse the flight with your own settings, and give your diagnosis with --answers.",
+)
+
+
+class Dropout(Record):
+    """Time span (s) in which the logger of the autopilot lost data."""
+
+    start_s: float
+    duration_s: NotNegative
+
+
+class Sender(Record):
+    """Sender of messages in a MAVLink recording.
+
+    Attributes
+    ----------
+    system, component : int
+        MAVLink ids.
+    description : str
+        Type from the heartbeat of the sender ("PX4 quadrotor", "companion computer").
+    messages : int
+        Number of messages with a valid checksum.
+    lost_fraction : float or None
+        Fraction of the sender's messages that the recording does not contain, from the sequence
+        numbers; None if the sender does not count its messages.
+    chosen : bool
+        True for the autopilot of the analysed flight.
+    """
+
+    system: int
+    component: int
+    description: str
+    messages: Count
+    lost_fraction: Share | None
+    chosen: bool
+
+
+class ClockMap(Record):
+    """Linear conversion of a clock to the autopilot's boot clock.
+
+    boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
+    """
+
+    # Name of the clock ("UNIX time of system 1, component 197")
+    clock: str
+    # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival
+    # time" or "position in the stream"
+    method: str
+    # Number of simultaneous readings of both clocks
+    pairs: Count
+    # Boot clock minus this clock, at the middle of the readings
+    offset_s: float
+    # Rate of the boot clock minus rate of this clock
+    drift_ppm: float
+    # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
+    jitter_s: NotNegative
+    # Limitation of the conversion, if any
+    note: str = ""
+    # Number of different timestamps, only if too few for a conversion
+    distinct_stamps: Count | None = None
+
+
+def clock_of_repeated_timestamps(
+    clock: str, sample_count: int, distinct_count: int
+) -> ClockMap | None:
+    """Describe a clock of which most timestamps are repeated, else return None."""
+    if 2 * distinct_count > sample_count:
+        return None
+    return ClockMap(
+        clock, "as sent", sample_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
+    )
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Origin of one kind of data: topics or messages, clock of the timestamps, and file name."""
+
+    topics: tuple[str, ...]
+    clock: str
+    log: str
+
+
+@dataclass(frozen=True)
+class UnusedData:
+    """Topic or message with position data that px4fuse does not use, and its number of messages."""
+
+    name: str
+    count: int
+    reason: str
+
+
+class InputFile(Record):
+    """Input file in addition to the log: name without folder, SHA-256, size (bytes) and role."""
+
+    name: str
+    sha256: Sha256
+    bytes: Count
+    role: Literal["position"]
+
+
+class LogInfo(Record, omit_defaults=False):
+    """Description of the log file; "unknown" for texts that are not in the log."""
+
+    # File name without folder
+    name: str
+    sha256: Sha256
+    bytes: Count
+    # A "MAVLink tlog" contains receive times, a "MAVLink stream" does not
+    format: Literal["ULog", "MAVLink tlog", "MAVLink stream"]
+    firmware: str
+    firmware_hash: str
+    hardware: str
+    # Boot clock at time zero of the flight, which is the first sample
+    boot_time_s: float
+    # ULog: duration of the IMU samples, else of the topic with the most samples. MAVLink: duration
+    # of the messages with boot time. Outliers of time are ignored
+    duration_s: NotNegative
+    dropouts: tuple[Dropout, ...] = ()
+    # PX4 parameters for fusion and logging at the start of the log
+    parameters: Mapping[str, int | float] = {}
+    # Sentences about dropped samples and clocks
+    notes: tuple[str, ...] = ()
+    autopilot: str = "PX4"
+    # UNIX time at time zero of the flight
+    start_unix_s: float | None = None
+    # Senders of a MAVLink recording, most messages first
+    senders: tuple[Sender, ...] = ()
+    # Hexadecimal identifier of the flight controller
+    vehicle: str = ""
+    # Sentences about damaged bytes of the file
+    damage: tuple[str, ...] = ()
+    # Number of bytes that were read as complete messages
+    bytes_read: Count = 0
+    # True if the land detector reports flight at the end of the data
+    ends_in_flight: bool = False
+    # Number of restarts of the boot clock; only data between two restarts are used
+    restarts: Count | None = None
+    # Number of backward jumps of the recording computer's clock
+    receive_time_reversals: Count | None = None
+    # Number of samples with invalid timestamps, by topic, message or file
+    dropped: Mapping[str, Count] = {}
+    # Firmware defaults of the changed EKF2 parameters; ULog only
+    parameter_defaults: Mapping[str, int | float] = {}
+    # True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis
+    is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
+
+    __repr__ = one_line_repr
+
+    def default_of(self, parameter: str) -> float:
+        """Return the default of an EKF2 parameter: the logged default, else PX4's since v1.14."""
+        return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
+
+    @property
+    def has_ulog(self) -> bool:
+        """True if the autopilot writes ULog files, as PX4 does."""
+        return self.autopilot != "ArduPilot"
+
 
 AxisName = Literal["north", "east", "down"]
 TableOrUnavailable = pd.DataFrame | Unavailable
@@ -69,6 +325,7 @@ NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dty
 class Columns:
     """Column names of all tables of a flight, with units."""
 
+    GEODETIC: Final = ["latitude_deg", "longitude_deg", "altitude_m"]
     POSITION: Final = ["north_m", "east_m", "down_m"]
     VELOCITY: Final = ["north_m_s", "east_m_s", "down_m_s"]
     STATE: Final = POSITION + VELOCITY
@@ -103,7 +360,7 @@ class Columns:
     ]
 
 
-class Alignment(Record, frozen=True, kw_only=True):
+class Alignment(Record, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
     A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the

@@ -6,6 +6,8 @@ const queryAll = (selector) => [...document.querySelectorAll(selector)];
 /* Make a node with a text and properties, or with a CSS class if `properties` is a string */
 const make = (tag, text = "", properties = {}) => Object.assign(document.createElement(tag),
   { textContent: text }, typeof properties === "string" ? { className: properties } : properties);
+/* Fraction of a logarithmic axis */
+const axisFraction = (ratio, [low, high]) => Math.log(ratio / low) / Math.log(high / low);
 const onClick = (id, act) => $(id).addEventListener("click", act);
 /* True for data that are missing: the page then contains the reason as a text */
 const isText = (data) => typeof data === "string";

@@ -46,10 +46,16 @@
   };
   const links = (rows) => fill(make("ul"), rows.map(([text, href]) =>
     fill(make("li"), [make("a", text, { href, rel: "noreferrer" })])));
-  // points and comments that the teacher typed, by student and item; only the download stores them
-  const typedRows = new Map();
+  // rows of overrides.csv by student and item, changed by what the teacher types; only the download stores them
+  const overrides = new Map();
   let hasUnsavedInput = false;
-  const setRow = (rows, ...row) => rows.set(row.slice(0, 2).join("\0"), row);
+  const setOverride = (...row) => overrides.set(row.slice(0, 2).join("\0"), row);
+  for (const [kind, , owner, rows, otherRows] of entries.flatMap(({ details }) => details)) {
+    if (kind !== "boxes") continue;
+    for (const [item, points, comment] of [...rows.map(([item, , ...row]) => [item, ...row]), ...otherRows]) {
+      if (points !== null || comment) setOverride(owner, item, points ?? "", comment);
+    }
+  }
   const boxes = (owner, rows, otherRows) => {
     const node = make("div", "", "boxes");
     for (const [item, max, points, comment] of rows) {
@@ -58,7 +64,7 @@
       for (const [title, field] of [[`Points for ${item} (maximum ${max})`, number], ["Comment", text]]) {
         node.append(fill(makeIsolated("label", title), [field]));
         field.addEventListener("input", () => {
-          setRow(typedRows, owner, item, number.value, text.value);
+          setOverride(owner, item, number.value, text.value);
           $("save").hidden = false;
           hasUnsavedInput = true;
         });
@@ -67,25 +73,13 @@
     if (otherRows.length) node.append(make("small", `${otherRows.length} other rows of overrides.csv stay unchanged.`));
     return node;
   };
-  /* Text of overrides.csv: rows of the page, replaced by the typed ones */
   const overridesText = () => {
-    const table = new Map();
-    for (const { details } of entries) {
-      for (const [kind, , owner, rows, otherRows] of details) {
-        if (kind !== "boxes") continue;
-        for (const [item, , points, comment] of rows) {
-          if (points !== null || comment) setRow(table, owner, item, points ?? "", comment);
-        }
-        for (const [item, points, comment] of otherRows) setRow(table, owner, item, points ?? "", comment);
-      }
-    }
-    for (const row of typedRows.values()) setRow(table, ...row);
     const quoted = (cell) => {
       const text = String(cell);
       // an apostrophe prevents that spreadsheets read the text as a formula
       return '"' + (/^[=+\-@\t\r]/.test(text) ? "'" : "") + text.replaceAll('"', '""') + '"';
     };
-    const all = [["id", "item", "points", "comment"], ...table.values()];
+    const all = [["id", "item", "points", "comment"], ...overrides.values()];
     return "\ufeff" + all.map((row) => row.map(quoted).join(",") + "\r\n").join("");
   };
   const makers = { list, prose, pairs, table, links, boxes };
@@ -99,9 +93,8 @@
 
   /* Mark of a σ ratio on a logarithmic axis with the consistent band; a triangle marks a ratio beyond its ends */
   const ratioMark = (ratio, against) => {
-    const [low, high] = axis.ends.map(Math.log), width = 70;
-    const fraction = (value) => (Math.log(value) - low) / (high - low), place = fraction(ratio);
-    const [from, to] = axis.bands[against].map((end) => width * fraction(end));
+    const width = 70, place = axisFraction(ratio, axis.ends);
+    const [from, to] = axis.bands[against].map((end) => width * axisFraction(end, axis.ends));
     return fill(makeSvg("svg", { width: width + 14, height: 20, viewBox: `-7 -10 ${width + 14} 20`, "aria-hidden": "true" }), [
       makeSvg("rect", { x: from, y: -8, width: to - from, height: 16, class: "band" }),
       makeSvg("line", { x2: width, class: "track" }),

@@ -1,7 +1,7 @@
 """Web page with one table that users can sort, search, filter and unfold."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -46,11 +46,15 @@ def text_cell(text: str, text_below: str = "") -> Cell:
     return Cell(text, text or None, text_below)
 
 
-def number_cell(value: float | None, text: str | None = None, text_below: str = "") -> Cell:
+def number_cell(
+    value: float | None,
+    format_value: Callable[[float], str] = "{:.4g}".format,
+    text_below: str = "",
+) -> Cell:
     """Return a cell sorted by a number; an empty cell if the value is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
-    return Cell(f"{value:.4g}" if text is None else text, value, text_below)
+    return Cell(format_value(value), value, text_below)
 
 
 Section = list[Any]
@@ -103,7 +107,7 @@ def boxes_section(
     title: str,
     person_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
-    other_rows: Sequence[tuple[str, float | None, str]] = (),
+    other_rows: Sequence[tuple[str, float | None, str]],
 ) -> Section:
     """Return a section with input boxes for points and comments, exported as CSV.
 

@@ -12,6 +12,8 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from px4fuse.core.text import convert_nested
+
 MAX_TEXT_LENGTH = 20_000
 # Control characters except tab and line feed, surrogates, and bidirectional overrides, which would
 # reverse the text after them
@@ -31,16 +33,12 @@ def clean_text(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
 
 
 def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
-    if isinstance(value, str):
-        return clean_text(value, max_length)
-    if isinstance(value, dict):
-        return {
-            clean_text(str(name), max_length): clean_values(element, max_length)
-            for name, element in value.items()
-        }
-    if isinstance(value, list | tuple):
-        return [clean_values(element, max_length) for element in value]
-    return value.item() if hasattr(value, "item") else value
+    def clean(element: Any) -> Any:
+        if isinstance(element, str):
+            return clean_text(element, max_length)
+        return element.item() if hasattr(element, "item") else element
+
+    return convert_nested(value, clean)
 
 
 def inert_json(value: object) -> str:

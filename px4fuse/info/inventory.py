@@ -1,7 +1,7 @@
 """Contents of a log, possible analyses, and advice on logging for the next flight."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import max_interval_s
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, to_json_types, utc_time
@@ -24,11 +24,12 @@ from px4fuse.filter.signals import (
     imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD, Stream
 from px4fuse.flight.model import (
+    DIAGNOSIS_WITHHELD,
     Ekf2,
     Flight,
     PositionTrack,
+    Stream,
     Unavailable,
     sample_rate,
 )
@@ -191,7 +192,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     """Convert the inventory of a log to JSON types, without unknown values."""
-    inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
+    inventory_fields = {**vars(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
     if isinstance(flight.airborne, Unavailable):
@@ -218,7 +219,9 @@ def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unav
     return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
 
 
-def _list_sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
+def _list_sources(
+    flight: Flight, comparison: PreparedComparison | None, reason: str
+) -> Iterator[Source]:
     data_by_stream = _data_by_stream(flight)
     for key, name in DATA_LABELS.items():
         if key in data_by_stream:
@@ -280,7 +283,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
 
 
 def _list_options(
-    flight: Flight, comparison: Comparison | None, reason: str
+    flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
     if comparison is None:
         yield AnalysisOption("compare", False, reason)
@@ -302,7 +305,9 @@ def _list_options(
     results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rates = (
-            f"{aid.label} {_rate_text(ekf2.aids[name].samples)}"
+            f"{aid.label} {sample_rate(samples):.2g} Hz"
+            if len(samples := ekf2.aids[name].samples) > 1
+            else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
         description = ", ".join(rates)
@@ -314,10 +319,6 @@ def _list_options(
     yield _make_option("what-if", inputs, description)
 
 
-def _rate_text(samples: pd.DataFrame) -> str:
-    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
-
-
 def _make_option(name: str, data: object, description: str) -> AnalysisOption:
     if isinstance(data, Unavailable):
         return AnalysisOption(name, False, data.reason)
@@ -325,13 +326,13 @@ def _make_option(name: str, data: object, description: str) -> AnalysisOption:
 
 
 def _analyses_against_ekf2_and_truth(
-    flight: Flight, comparison: Comparison | None
+    flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that compare KF with EKF2 and with ground truth."""
     data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
-        main_line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
+        main_line, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
         state, variance, truth = project_tracks(
             ekf2, comparison.flight.truth, main_line, segment
         ).values()
@@ -350,7 +351,7 @@ def _analyses_against_ekf2_and_truth(
 
 
 def _logging_advice(
-    flight: Flight, comparison: Comparison | None, remedy: str
+    flight: Flight, comparison: PreparedComparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings on the recording and of missing data, each action once."""
     if flight.log.is_assessed:

@@ -71,6 +71,13 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
     return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
 
 
+def to_bytes(table: pd.DataFrame, file_format: str) -> bytes:
+    """Encode a table as Parquet or CSV; pandas writes enough digits to read equal numbers again."""
+    if file_format == "parquet":
+        return table.to_parquet(engine="pyarrow", index=False)
+    return table.to_csv(index=False, lineterminator="\n").encode()
+
+
 def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
     """List the missing data of a flight, which have no table, with the reasons."""
     ekf2 = flight.ekf2

@@ -7,18 +7,18 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
-from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
+    ClosureAndLanding,
+    build_pose_graph,
     correct_paths_by_distance,
     gate_closures,
     score_paths,
     solve_pose_graphs,
 )
 from px4fuse.loop.model import LANDING_SOURCE, Loop, OdometryNoise, TrueEnd
-from px4fuse.loop.odometry import ClosureAndLanding, build_pose_graph
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie

@@ -8,31 +8,22 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.alignment.tracks import FRAMES
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversion of each frame to a frame with z down: order and signs of the axes, new frame, and note
-_Z_DOWN_CONVERSIONS: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
-    "ENU": (
-        [1, 0, 2],
-        [1.0, 1.0, -1.0],
-        "NED",
-        "the axes were converted from east, north, up to north, east, down",
-    ),
+# Conversion of each frame to a frame with z down: key of FRAMES (with forward instead of north for
+# FRD), new frame, and note
+_Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
+    "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
-        [2, 0, 1],
-        [1.0, 1.0, 1.0],
+        "edn",
         "FRD",
         "the axes were converted from right, down, forward (camera) to forward, right, down",
     ),
-    "unknown": (
-        [0, 1, 2],
-        [1.0, -1.0, -1.0],
-        "FRD",
-        "the coordinate frame is unknown, so z is assumed to be up",
-    ),
+    "unknown": ("nwu", "FRD", "the coordinate frame is unknown, so z is assumed to be up"),
 }
 # Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
 # the extent
@@ -49,7 +40,8 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     """
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
-    axis_order, axis_signs, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
+    axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
+    axis_order, axis_signs = FRAMES[axes]
     position_variance_m2 = trajectory.position_variance_m2
     return replace(
         _rotate(trajectory, np.diag(axis_signs) @ np.eye(3)[axis_order], z_down_frame),
@@ -65,7 +57,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """Convert a result of :func:`to_z_down` back to the original ``frame``."""
     if frame not in _Z_DOWN_CONVERSIONS or trajectory.frame in _Z_DOWN_CONVERSIONS:
         return trajectory
-    axis_order, axis_signs, _, _ = _Z_DOWN_CONVERSIONS[frame]
+    axis_order, axis_signs = FRAMES[_Z_DOWN_CONVERSIONS[frame][0]]
     return _rotate(trajectory, (np.diag(axis_signs) @ np.eye(3)[axis_order]).T, frame)
 
 

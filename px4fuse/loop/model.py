@@ -23,7 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
+# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.solver.SOLUTIONS
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -36,7 +36,7 @@ CorrectionName = Literal[
 LANDING_SOURCE = "landing"
 
 
-class TrueEnd(Record, frozen=True, kw_only=True):
+class TrueEnd(Record, kw_only=True):
     """True landing place relative to the take-off place.
 
     Attributes
@@ -65,7 +65,7 @@ class TrueEnd(Record, frozen=True, kw_only=True):
         return np.array(list(self.displacement_m.values()))
 
 
-class OdometryNoise(Record, frozen=True, omit_defaults=False):
+class OdometryNoise(Record, omit_defaults=False):
     """Drift of odometry: random walks over distance and over time.
 
     The defaults are for indoor visual-inertial odometry: about 1 % of the distance (Delmerico and
@@ -83,7 +83,7 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
     tilt_share: NotNegative = 0.1
 
 
-class Closure(Record, frozen=True, kw_only=True):
+class Closure(Record, kw_only=True):
     """Loop closure (two times at the same place), with gate result and robust weight."""
 
     # Two times at the same place, on the clock of the trajectory
@@ -109,7 +109,7 @@ class Closure(Record, frozen=True, kw_only=True):
         return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
-class CorrectedPath(Record, frozen=True, kw_only=True):
+class CorrectedPath(Record, kw_only=True):
     """Corrected path, or uncorrected odometry, with its scores against each reference."""
 
     # Largest and RMS displacement of the poses by the correction
@@ -126,7 +126,7 @@ class CorrectedPath(Record, frozen=True, kw_only=True):
     solution: NotWritten[Solution | None] = None
 
 
-class Loop(Record, frozen=True, kw_only=True):
+class Loop(Record, kw_only=True):
     """Result of ``px4fuse loop``: path, landing place, closure errors and corrections.
 
     Attributes

@@ -15,9 +15,9 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, read_head, split_path_and_part
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight.log import DIAGNOSIS_WITHHELD
 from px4fuse.flight.model import (
     AXIS_NAMES,
+    DIAGNOSIS_WITHHELD,
     Columns,
     Ekf2,
     Flight,

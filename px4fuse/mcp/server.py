@@ -47,7 +47,7 @@ ParseArguments = Callable[[Mapping[str, Any]], tuple[list[str], list[Path]]]
 
 
 # Title and text of each prompt, by its name
-PROMPTS = read_toml(__file__, "prompts.toml", dict[str, dict[str, str]])
+PROMPTS = read_toml(__file__, dict[str, dict[str, str]], "prompts.toml")
 
 
 class Server(MCPServer[Any]):
@@ -79,7 +79,9 @@ class Server(MCPServer[Any]):
         self._run, self._limits = run, (timeout_s, memory_bytes)
         self._one_at_a_time, self._cache = anyio.Lock(), dict[tuple[str, ...], Answer]()
         self._add_resource("glossary", "Glossary", "text/markdown", _read_glossary)
-        self._add_resource("results", "JSON Schema of results", "application/json", _format_schema)
+        self._add_resource(
+            "results", "JSON Schema of results", "application/json", lambda: to_json(schema())
+        )
         for name, title in TITLES.items():
             self._add_resource(
                 f"findings/{name}", title, "text/plain", partial(self._explain, name)
@@ -158,10 +160,6 @@ def _make_prompt(name: str, title: str, text: str) -> Prompt:
         return [text, log]
 
     return Prompt.from_function(make_messages, name, title, title)
-
-
-def _format_schema() -> str:
-    return to_json(schema())
 
 
 def _read_glossary() -> str:

@@ -50,16 +50,16 @@ def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
     """Return True if the last interval in flight lasts until the end of the data."""
-    last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
-    return any(span_end_s >= duration_s for _, span_end_s in last_span)
+    return not isinstance(airborne, Unavailable) and any(
+        end_s >= duration_s for _, end_s in airborne
+    )
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
-    flight_text = ", in flight" if in_flight else ""
     return (
-        f"the file ends within a {unit} after {duration_s:.1f} s{flight_text}; later data are "
-        "missing"
+        f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
+        "data are missing"
     )
 
 

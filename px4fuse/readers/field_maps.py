@@ -3,6 +3,7 @@
 The files are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,7 +15,6 @@ from px4fuse.flight.model import Columns
 # Maximum absolute value of valid fields: larger values are from damaged bytes. The largest valid
 # values are UNIX times in µs (1.8e15)
 MAX_FIELD_VALUE = 1e17
-GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,8 @@ def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
     >>> expand_columns({"north_m2 east_m2": "covariance[0 6]", "w x": 1.0})
     {'north_m2': 'covariance[0]', 'east_m2': 'covariance[6]', 'w': 1.0, 'x': 1.0}
+    >>> expand_columns({"a b": "hpos[0] vpos"})
+    {'a': 'hpos[0]', 'b': 'vpos'}
     """
     columns: dict[str, Any] = {}
     for column_names, field_names in fields.items():
@@ -65,12 +67,9 @@ def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(field_names, float):
             columns |= dict.fromkeys(column_list, field_names)
             continue
-        array_name, is_array, element_text = field_names.removesuffix("]").partition("[")
-        element_numbers = element_text.split() or range(len(column_list))
-        column_fields = (
-            [f"{array_name}[{element}]" for element in element_numbers]
-            if is_array
-            else field_names.split()
-        )
+        column_fields = field_names.split()
+        if array := re.fullmatch(r"([^\[]+)\[([\d ]*)\]", field_names):
+            elements = array[2].split() or range(len(column_list))
+            column_fields = [f"{array[1]}[{element}]" for element in elements]
         columns |= zip(column_list, column_fields, strict=True)
     return columns

@@ -5,7 +5,6 @@ and MAVLink's ``common.xml``. They are tabulated in ``mavlink_messages.toml``.
 """
 
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -17,15 +16,16 @@ from px4fuse.flight.ekf2_parameters import (
     effective_settings,
     replace_invalid_parameters,
 )
-from px4fuse.flight.log import LogInfo, UnusedData
 from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
     Ekf2,
     Flight,
+    LogInfo,
     Spans,
     TableOrUnavailable,
     Unavailable,
+    UnusedData,
 )
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
@@ -94,7 +94,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         airborne=airborne,
         barometer=barometer(pressure_altitude(pressure_hpa)),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
-        streams=MappingProxyType(recording.streams),
+        streams=recording.streams,
         clocks=senders.clock_maps(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
@@ -148,29 +148,23 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
-    message_counts = {
-        layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
-    }
-    # ODOMETRY has variances, so it is preferred unless its message rate is below half of the
-    # highest message rate
-    layout = next(
-        layout
-        for layout in messages.STATE_LAYOUTS
-        if 2 * message_counts[layout.topic] >= max(message_counts.values())
+    odometry, local_position = messages.STATE_LAYOUTS
+    odometry_count, other_count = (
+        len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
     )
+    # ODOMETRY has variances, so it is preferred unless its message rate is below half of the rate
+    # of LOCAL_POSITION_NED
+    layout = odometry if 2 * odometry_count >= other_count else local_position
     message_name = layout.topic
-    if message_counts[message_name] < 2:
+    if len(recording.rows(message_name)) < 2:
         return Unavailable(
             "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
         )
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
-        return Unavailable(
-            "EKF2",
-            f"{message_name} contains no finite EKF2 state",
-            "Start the recording after EKF2 has started.",
-        )
+        reason = f"{message_name} contains no finite EKF2 state"
+        return Unavailable("EKF2", reason, "Start the recording after EKF2 has started.")
     recording.record_stream("ekf2_state", message_name)
     notes = [f"the EKF2 state is from {message_name}, which the autopilot sent"]
     if autopilot != "PX4":
@@ -182,28 +176,26 @@ def _read_ekf2(
             f"EKF2 reset its state {reset_count} times; the resets were not removed, because "
             "ODOMETRY does not contain the size of a reset"
         )
-    variance_rows = samples.reindex(columns=VARIANCE_COLUMNS)
-    variance_rows = variance_rows[(variance_rows > 0.0).all(axis=1)]
-    if variance_rows.empty:
+    variance = samples.reindex(columns=VARIANCE_COLUMNS)
+    variance = variance[(variance > 0.0).all(axis=1)]
+    if variance.empty:
         message_name = messages.LAYOUTS["accuracy"].topic
-        variance_rows = _variance_from_accuracy(recording)
-        if len(variance_rows):
+        variance = _variance_from_accuracy(recording)
+        if len(variance):
             notes.append(
                 "the EKF2 position variances are from ESTIMATOR_STATUS (on each horizontal axis "
                 "half of the squared horizontal accuracy); velocity variances are not sent"
             )
-    variance: TableOrUnavailable = variance_rows
-    if variance_rows.empty:
-        variance = Unavailable(
-            "EKF2 variances",
-            "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-            remedies["variance"],
-        )
-    else:
+    if len(variance):
         recording.record_stream("ekf2_variance", message_name)
+    no_variance = Unavailable(
+        "EKF2 variances",
+        "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+        remedies["variance"],
+    )
     return Ekf2(
         state=state,
-        variance=variance,
+        variance=variance if len(variance) else no_variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -233,10 +225,10 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.LAYOUTS["accuracy"])
-    variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
-    variance["north_m2"] = variance["east_m2"] = accuracy["horizontal_m"] ** 2 / 2.0
-    variance["down_m2"] = accuracy["vertical_m"] ** 2
-    return variance[(variance[Columns.POSITION_VARIANCE] > 0.0).all(axis=1)]
+    horizontal_m2 = accuracy["horizontal_m"] ** 2 / 2.0
+    variance = pd.concat([horizontal_m2, horizontal_m2, accuracy["vertical_m"] ** 2], axis=1)
+    variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
+    return variance.reindex(columns=VARIANCE_COLUMNS)
 
 
 def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
@@ -278,11 +270,9 @@ def _describe_log(
     is_in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
-    truncation = (
-        (common.format_truncation("frame", recording.duration_s, is_in_flight),)
-        if frames.ends_in_frame
-        else ()
-    )
+    damage = []
+    if frames.ends_in_frame:
+        damage.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     firmware = f"{autopilot} (version not in the recording)"
     firmware_hash = "unknown"
     vehicle = ""
@@ -309,7 +299,7 @@ def _describe_log(
         hardware=f"{vehicle_name} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         notes=(*recording.notes, *parameter_faults, *dropped_notes(dropped)),
         restarts=recording.restarts,
         receive_time_reversals=recording.receive_time_reversals,
@@ -318,7 +308,7 @@ def _describe_log(
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle,
-        damage=(*truncation, *recording.damage),
+        damage=(*damage, *recording.damage),
         ends_in_flight=is_in_flight,
         bytes_read=len(frames.content) - frames.bad_byte_count,
     )

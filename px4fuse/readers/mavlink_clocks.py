@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array
-from px4fuse.flight.log import ClockMap
+from px4fuse.flight.model import ClockMap
 
 # Maximum median difference (s) between timestamps of a sender and the receive time since boot: with
 # a larger difference the timestamps are not boot time

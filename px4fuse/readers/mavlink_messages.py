@@ -10,8 +10,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.core.record import read_toml
-from px4fuse.flight.model import RECORD_NOT_LOGGED, Unavailable
-from px4fuse.flight.position_source import Origin, find_origin
+from px4fuse.flight.model import RECORD_NOT_LOGGED, Origin, Unavailable, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -82,7 +81,7 @@ class FrameOfReference:
     body: bool = False
 
 
-_TABLE = read_toml(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 assert not any(row.optional for row in LAYOUTS.values()), "mavlink_messages.toml: use `columns`"
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])

@@ -9,12 +9,11 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable
-from px4fuse.flight.position_source import GNSS, with_orientation
+from px4fuse.flight.model import GNSS, Columns, PositionTrack, Truth, Unavailable, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
-from px4fuse.readers.field_maps import GLOBAL_COLUMNS, Layout
+from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
@@ -167,7 +166,7 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     """
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
-        return tuple(sent_origin[GLOBAL_COLUMNS].iloc[-1].tolist())
+        return tuple(sent_origin.iloc[-1].tolist())
     joined = join_nearest(
         recording.read(messages.LAYOUTS["global_state"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
@@ -177,7 +176,7 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     if joined.empty:
         return None
     position_pairs = zip(
-        joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True
+        joined[Columns.GEODETIC].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True
     )
     origins = [
         (*unproject(-n, -e, tuple(position[:2])), position[2] + d)
@@ -201,10 +200,11 @@ def read_truth(
         if len(rows) < px4_positions.MIN_TRACK_SAMPLES:
             continue
         samples = recording.read(layout, rows, recording.receipt_boot_s(rows))
-        samples = samples.dropna(subset=GLOBAL_COLUMNS[:2])
+        samples = samples.dropna(subset=Columns.GEODETIC[:2])
         if not samples["latitude_deg"].any():
             continue
-        samples = samples.reindex(columns=[*GLOBAL_COLUMNS, *Columns.VELOCITY, *Columns.QUATERNION])
+        columns = Columns.GEODETIC + Columns.VELOCITY + Columns.QUATERNION
+        samples = samples.reindex(columns=columns)
         if not samples[Columns.VELOCITY].to_numpy().any():
             # Velocities that are zero in all samples were not sent
             samples[Columns.VELOCITY] = np.nan

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.flight.log import Stream
-from px4fuse.flight.model import Columns, time_index
+from px4fuse.flight.model import Columns, Stream, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.mavlink_clocks import (
@@ -28,6 +27,7 @@ from px4fuse.readers.mavlink_frames import (
 )
 from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, FRAMES_OF_REFERENCE
 from px4fuse.readers.ulog_topics import longest_increasing_run
+from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "receive time minus minimum link delay"
@@ -112,19 +112,15 @@ class Recording:
         # One hour of IMU data has hundreds of megabytes, so fields are copied only once
         values = np.empty((len(selected_rows), len(layout.columns)))
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            array_name, _, index = field_name.removesuffix("]").partition("[")
-            field_values = table[array_name][:, int(index)] if index else table[array_name]
-            values[:, column_index] = field_values.astype(np.float64) * layout.scale.get(
-                column, 1.0
+            array_name, _, element = field_name.removesuffix("]").partition("[")
+            values[:, column_index] = (
+                table[array_name][:, int(element)] if element else table[array_name]
             )
+            values[:, column_index] *= layout.scale.get(column, 1.0)
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
-        samples = pd.DataFrame(
-            values,
-            time_index(boot_s[selected_rows] - self.zero_s),
-            list(layout.columns),
-            copy=False,
-        )
+        index = time_index(boot_s[selected_rows] - self.zero_s)
+        samples = pd.DataFrame(values, index, list(layout.columns), copy=False)
         if "roll" in samples:
             attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
             samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
@@ -138,11 +134,10 @@ class Recording:
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, is one sample
         first_copies = np.sort(np.unique(time_us, return_index=True)[1])
-        selected_rows: IntArray = rows[first_copies[longest_increasing_run(time_us[first_copies])]]
-        dropped_count = len(boot_s) - len(rows) + len(first_copies) - len(selected_rows)
-        if dropped_count:
-            self.dropped[name] = dropped_count
-        return selected_rows
+        increasing_rows = longest_increasing_run(time_us[first_copies])
+        if dropped := len(boot_s) - len(rows) + len(first_copies) - len(increasing_rows):
+            self.dropped[name] = dropped
+        return np.asarray(rows[first_copies[increasing_rows]])
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
         """Return the receive time since boot (s) of frames, minus the minimum link delay."""
@@ -153,14 +148,12 @@ class Recording:
         if not self.receipt_to_boot.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
-            return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
-        timestamp_s = table["time_usec"] * 1e-6
+            return np.asarray(table["time_boot_ms"] * 1e-3)
+        timestamp_s: Array = table["time_usec"] * 1e-6
         is_boot_time = (timestamp_s > 0.0) & (
             (timestamp_s < MIN_UNIX_TIME_S) == (self.zero_s < MIN_UNIX_TIME_S)
         )
-        return np.asarray(
-            np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows)), dtype=np.float64
-        )
+        return np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Record the messages and the clock of one kind of data, such as "imu"."""
@@ -174,36 +167,31 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
     the sender's body axes are unknown.
     """
-    has_quaternion = (
-        np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1) > MIN_QUATERNION_NORM
-    )
+    quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
+    has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
     ned_samples = samples.copy()
     ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
     for number, frame in FRAMES_OF_REFERENCE.items():
-        order, signs, is_body = frame.order, frame.signs, frame.body
-        frame_samples = samples[(samples["frame_id"] == number) & (not is_body)]
-        position = frame_samples[Columns.POSITION].to_numpy()[:, order]
-        variance = frame_samples[Columns.POSITION_VARIANCE].to_numpy()[:, order]
-        ned_samples.loc[frame_samples.index, Columns.POSITION] = position * signs
-        ned_samples.loc[frame_samples.index, Columns.POSITION_VARIANCE] = variance
-        if min(signs) > 0.0:
-            ned_samples.loc[frame_samples.index, orientation] = frame_samples[orientation]
-        child_samples = samples[
-            (samples["child_frame_id"] == number) & (has_quaternion | (not is_body))
-        ]
-        velocity = child_samples[Columns.VELOCITY].to_numpy()[:, order] * signs
-        velocity_variance = child_samples[Columns.VELOCITY_VARIANCE].to_numpy()[:, order]
-        if is_body and len(child_samples):
-            rotation = Rotation.from_quat(
-                child_samples[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
-            ).as_matrix()
-            velocity = np.einsum("nij,nj->ni", rotation, velocity)
-            # The variances in NED are the diagonal of R diag(σ²) Rᵀ
-            velocity_variance = np.einsum("nij,nj->ni", rotation**2, velocity_variance)
-        ned_samples.loc[child_samples.index, Columns.VELOCITY] = velocity
-        ned_samples.loc[child_samples.index, Columns.VELOCITY_VARIANCE] = velocity_variance
+        is_body = frame.body
+        in_frame = (samples["frame_id"] == number) & (not is_body)
+        in_child_frame = (samples["child_frame_id"] == number) & (has_quaternion | (not is_body))
+        if min(frame.signs) > 0.0:
+            ned_samples.loc[in_frame, orientation] = samples.loc[in_frame, orientation]
+        for rows, vector_columns, variance_columns in (
+            (in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
+            (in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
+        ):
+            vectors = samples.loc[rows, vector_columns].to_numpy()[:, frame.order] * frame.signs
+            variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.order]
+            if is_body and rows.any():
+                rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
+                vectors = rotate(rotation, vectors)
+                # The variances in NED are the diagonal of R diag(σ²) Rᵀ
+                variances = rotate(rotation**2, variances)
+            ned_samples.loc[rows, vector_columns] = vectors
+            ned_samples.loc[rows, variance_columns] = variances
     return ned_samples
 
 
@@ -228,14 +216,11 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
     times_s = np.concatenate(all_times_s)
     is_boot_time = (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S)
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
-    if np.count_nonzero(is_usable) >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(
-        times_s[is_usable]
-    ):
-        is_usable = np.zeros_like(is_usable)
-    rows = rows[is_usable]
-    times_s = times_s[is_usable]
-    order = np.argsort(rows, kind="stable")
-    return rows[order], times_s[order]
+    if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
+        is_usable &= False
+    usable = np.flatnonzero(is_usable)
+    usable = usable[np.argsort(rows[usable])]
+    return rows[usable], times_s[usable]
 
 
 def read_recording(frames: Frames, address: Address) -> Recording:
@@ -253,8 +238,8 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     if len(restart_rows):
         row_limits = [0, *restart_rows.tolist(), len(rows)]
         session_index = int(np.argmax(np.diff(row_limits)))
-        session_rows = slice(row_limits[session_index], row_limits[session_index + 1])
-        used_fraction = (session_rows.stop - session_rows.start) / len(rows)
+        session_rows = slice(*row_limits[session_index : session_index + 2])
+        used_fraction = len(rows[session_rows]) / len(rows)
         rows, boot_s = rows[session_rows], boot_s[session_rows]
         session = slice(
             int(rows[0]) if session_index else 0,
@@ -277,29 +262,28 @@ def read_recording(frames: Frames, address: Address) -> Recording:
             receipt_to_boot = fit_least_delay(boot_s, received_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times; the last boot time before each frame is used instead
-        previous_row = np.clip(
-            np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None
-        )
-        received_s = boot_s[previous_row]
+        previous_rows = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
+        received_s = boot_s[np.maximum(previous_rows, 0)]
     else:
         notes.append("no message in the stream contains a time")
     receipt_reversal_count = int(np.count_nonzero(np.diff(received_s) < 0.0))
-    if unknown_count := frames.unknown_frame_count:
-        notes.append(f"number of ignored frames with unknown message type: {unknown_count}")
-    if damaged_count := frames.damaged_receive_time_count:
-        notes.append(f"number of damaged receive times that were interpolated: {damaged_count}")
-    if receipt_reversal_count:
-        notes.append(f"number of backward jumps of the receive time: {receipt_reversal_count}")
-    lost_fraction = frames.bad_byte_count / len(frames.content)
+    for quantity, count in (
+        ("ignored frames with unknown message type", frames.unknown_frame_count),
+        ("damaged receive times that were interpolated", frames.damaged_receive_time_count),
+        ("backward jumps of the receive time", receipt_reversal_count),
+    ):
+        if count:
+            notes.append(f"number of {quantity}: {count}")
+    bad_bytes, byte_count = frames.bad_byte_count, len(frames.content)
     lost_text = (
-        f"{frames.bad_byte_count:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink "
+        f"{bad_bytes:,} bytes ({bad_bytes / byte_count:.2%}) are not part of a complete MAVLink "
         "frame"
     )
+    damage: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file do not count as damage
-    bytes_inside = frames.bad_byte_count - 2 * MAX_FRAME_BYTES
-    is_damaged = bytes_inside > MAX_STRAY_BYTE_FRACTION * len(frames.content)
-    damage = (f"the file is damaged: {lost_text}",) if is_damaged else ()
-    if frames.bad_byte_count and not is_damaged:
+    if bad_bytes - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
+        damage = (f"the file is damaged: {lost_text}",)
+    elif bad_bytes:
         notes.append(lost_text)
     # Without a boot clock, flight time is receive time
     zero_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[[0, -1]].tolist()
@@ -333,9 +317,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:
     """Map the boot clock to UNIX time by SYSTEM_TIME, if it contains UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
-    boot_s = table["time_boot_ms"] * 1e-3
-    unix_s = table["time_unix_usec"] * 1e-6
-    is_known = unix_s > MIN_UNIX_TIME_S
-    if not np.any(is_known):
+    table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
+    if not len(table):
         return None
-    return fit_least_delay(boot_s[is_known], unix_s[is_known])
+    return fit_least_delay(table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from px4fuse.core.arrays import IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.flight.log import ClockMap, Sender
+from px4fuse.flight.model import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
     MAX_RATE_DIFFERENCE,

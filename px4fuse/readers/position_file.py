@@ -20,7 +20,6 @@ from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid_rows, rounding_step
-from px4fuse.readers.formats import refuse_foreign_format
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_UNITS,
@@ -38,7 +37,7 @@ from px4fuse.readers.recording_table import (
     find_table,
 )
 from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, refuse_foreign_format
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
@@ -164,9 +163,10 @@ def read_position_file(
     empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     times = numbers[time_column].to_numpy()
-    name_unit = meanings[time_column].unit if meanings[time_column].unit in TIME_UNITS else ""
     units, interval_range_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
-    unit, unit_text = _time_unit(times, name_unit, time_unit, units, interval_range_s)
+    unit, unit_text = _time_unit(
+        times, meanings[time_column].unit, time_unit, units, interval_range_s
+    )
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
     if table.rate_hz is not None:
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
@@ -357,17 +357,18 @@ def _select_body(
 
 def _column_indices(table: Table, columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
-    numbers = [str(index + 1) for index in range(len(names))]
+    # A name is preferred to the number of a column
+    names += [str(index + 1) for index in range(len(names))]
     indices = []
     for column in columns:
         wanted_name = column.strip().casefold()
-        if wanted_name not in names + numbers:
+        if wanted_name not in names:
             raise SettingsError(
                 f"{table.file_name} has no column {quote(column)}; the columns are "
-                f"{table.label(*range(len(names)))}",
+                f"{table.label(*range(len(table.names)))}",
                 f"Name the columns with {COLUMNS_OPTION}.",
             )
-        indices.append((names if wanted_name in names else numbers).index(wanted_name))
+        indices.append(names.index(wanted_name) % len(table.names))
     if len({*indices}) < len(indices):
         raise SettingsError(f"{COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice.")
     return indices
@@ -409,11 +410,11 @@ def _choose_columns(
             ),
         )
         time_text = table.label(time)
-        for index in other_times:
+        for index in [*other_times]:
             are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time] += numbers[index] * 1e-9
-                other_times = [column for column in other_times if column != index]
+                other_times.remove(index)
                 time_text += f" plus {table.label(index)}"
         if other_times:
             time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
@@ -443,7 +444,7 @@ def _time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median = float(np.median(times)) if len(times) else 0.0
-    if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
+    if abs(median) * TIME_UNITS.get(name_unit, np.inf) < UNIX_END_S:
         return name_unit, "the column name contains the unit"
     steps = np.diff(times)
     median_step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0

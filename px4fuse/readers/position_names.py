@@ -12,7 +12,7 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Column indices of x, y and z; None without height
 PositionColumns = tuple[int, int, int | None]
-_TABLE = read_toml(__file__, "position_names.toml", dict[str, dict[str, str]])
+_TABLE = read_toml(__file__, dict[str, dict[str, str]])
 _UNITS, _AXES = (
     {
         word: meaning

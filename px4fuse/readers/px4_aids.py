@@ -6,7 +6,6 @@ field names are in ``ekf2_parameters.toml``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
-from px4fuse.readers.field_maps import Layout
+from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time difference (s) between an innovation and the logged variance S: the default logging
@@ -63,15 +62,16 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     enabled_aids = {}
     tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *DISTURBANCES.values())
-    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
+    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
     if logged_flags:
         layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flags})
         flags = topics.primary_samples(layout, step=True)
         for aid in all_aids if len(flags) else ():
-            group = next((group for group in aid.flags if {*group} <= {*logged_flags}), None)
+            groups = (group.split(",") for group in aid.flags)
+            group = next((group for group in groups if {*group} <= {*logged_flags}), None)
             if group is not None:
-                enabled_aids[aid.name] = flags[list(group)].max(axis=1)
+                enabled_aids[aid.name] = flags[group].max(axis=1)
     if not logged_flags and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
         for aid in all_aids if len(bits) else ():
@@ -82,20 +82,17 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    axis_count = len(aid.axes)
-    elements = [""] if axis_count == 1 else [f"[{number}]" for number in range(axis_count)]
-    columns = {
-        f"{column_prefix}_{axis}": field_name + element
-        for axis, element in zip(aid.axes, elements, strict=True)
-        for column_prefix, field_name in (
-            *((("observation", "observation"),) if aid.name in px4.AIDS_WITH_OBSERVATION else ()),
-            ("innovation", "innovation"),
-            ("variance", "innovation_variance"),
-            ("noise", "observation_variance"),
-            ("ratio", "test_ratio"),
-        )
+    fields = {
+        "innovation": "innovation",
+        "variance": "innovation_variance",
+        "noise": "observation_variance",
+        "ratio": "test_ratio",
     }
-    columns |= {"fused": "fused", "rejected": "innovation_rejected"}
+    if aid.name in px4.AIDS_WITH_OBSERVATION:
+        fields["observation"] = "observation"
+    columns = {"fused": "fused", "rejected": "innovation_rejected"}
+    for name, field in fields.items():
+        columns |= _columns_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
     layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
     if topics.find(layout) is None:  # return early: reading an empty table takes time
         return None
@@ -121,7 +118,7 @@ def _read_common_topics(
         )
     if aid.old_fields:
         fields = _columns_by_axis("innovation", aid, aid.old_fields)
-        variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
+        variance_fields = aid.old_fields.replace("innov", "innov_var")
         fields |= _columns_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
     for value_layout, variance_layout in layouts:
@@ -159,8 +156,8 @@ def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
 
-def _columns_by_axis(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
-    return {f"{name}_{axis}": field for axis, field in zip(aid.axes, fields, strict=True)}
+def _columns_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
+    return expand_columns({" ".join(f"{name}_{axis}" for axis in aid.axes): fields})
 
 
 def _make_aid_log(
@@ -178,9 +175,7 @@ def _make_aid_log(
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:
         return None
-    negated_innovations = {
-        column: -samples[column] for column in _columns_by_axis("innovation", aid, aid.axes)
-    }
+    innovations = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
-    samples = samples.assign(**negated_innovations)
+    samples = samples.assign(**-samples[innovations])
     return AidLog(used_topics, aid.axes, samples, enabled, parameters, excluded_count)

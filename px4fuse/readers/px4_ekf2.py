@@ -11,9 +11,13 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, IntArray, median_interval
-from px4fuse.flight import model as flight
 from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
 from px4fuse.flight.model import (
+    BIAS_NOT_LOGGED,
+    EKF2_STEP_S,
+    FLOW_FILTER_WEIGHT,
+    HORIZON_NOT_LOGGED,
+    RECORD_NOT_LOGGED,
     Columns,
     Ekf2,
     FusionRecord,
@@ -193,7 +197,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
 
 def configured_step_s(topics: Topics) -> float:
     """Return the configured prediction interval, EKF2_PREDICT_US, in s."""
-    return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
+    return topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _prediction_interval_s(topics: Topics) -> float:
@@ -250,7 +254,7 @@ def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> Ta
     if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias
     if isinstance(delayed_state, Unavailable) or delayed_state.empty:
-        return flight.BIAS_NOT_LOGGED
+        return BIAS_NOT_LOGGED
     return delayed_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
@@ -263,7 +267,7 @@ def _horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
     age_s = _publication_age_s(topics, _state_vector(topics)[0])
     if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
         return median_age_s
-    return flight.HORIZON_NOT_LOGGED
+    return HORIZON_NOT_LOGGED
 
 
 def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
@@ -327,11 +331,11 @@ def _read_fusion_record(
     """
     topic, attitude_variance_count = _state_vector(topics)
     if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(delayed_state, Unavailable):
-        return flight.RECORD_NOT_LOGGED
+        return RECORD_NOT_LOGGED
     quaternion_norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
     usable_state = delayed_state[np.abs(quaternion_norm - 1.0) < 0.01].copy()
     if usable_state.empty:
-        return flight.RECORD_NOT_LOGGED
+        return RECORD_NOT_LOGGED
     horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
     # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
@@ -406,7 +410,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     if FLOW.name in enabled_aids:
         rows = rows[step_values_at(enabled_aids[FLOW.name], times[rows]) > 0.0]
     sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
-    filter_memory = ((1.0 - flight.FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
+    filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     low_passed = velocity[["forward_m_s", "right_m_s"]].to_numpy()
     forward, right = (
         (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)

@@ -51,20 +51,15 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     """
     if isinstance(ekf2, Unavailable):
         return False
-    aid_log = ekf2.aids.get(aid)
-    if aid_log is not None and "fused" in aid_log.samples:
-        return bool(aid_log.samples["fused"].any())
-    if aid_log is not None and aid_log.enabled is not None:
-        return True
+    if aid_log := ekf2.aids.get(aid):
+        if "fused" in aid_log.samples:
+            return bool(aid_log.samples["fused"].any())
+        if aid_log.enabled is not None:
+            return True
     # without fusion flags, a valid global position shows that EKF2 fused GNSS
-    has_flags = "tilt_align" in ekf2.states
-    global_flags = ekf2.states.get("xy_global")
-    return (
-        aid == GNSS_POS.name
-        and not has_flags
-        and global_flags is not None
-        and bool(global_flags.any())
-    )
+    if aid != GNSS_POS.name or "tilt_align" in ekf2.states or "xy_global" not in ekf2.states:
+        return False
+    return bool(ekf2.states["xy_global"].any())
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
@@ -82,9 +77,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
         fusion_flags = (
             pd.DataFrame(enabled_flags).ffill().bfill().reindex(columns=columns, fill_value=0.0)
         )
-    aid_log = ekf2.aids.get("gnss_pos")
-    parameters = {} if aid_log is None else aid_log.parameters
-    gate = parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
+    gate = ekf2.parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
     innovations, topics = innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
         ekf2,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,20 +10,23 @@ from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
-from px4fuse.flight.log import REPEATED_TIMESTAMPS, SENDER_CLOCK, ClockMap
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
+    SENDER_CLOCK,
+    ClockMap,
     Columns,
     Ekf2,
+    Origin,
     PositionTrack,
     Truth,
     Unavailable,
+    clock_of_repeated_timestamps,
     kind_without_orientation,
     sample_rate,
     time_index,
+    with_orientation,
 )
-from px4fuse.flight.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     find_invalid_rows,
@@ -35,7 +37,6 @@ from px4fuse.readers.common import (
     read_orientation,
     rounding_step,
 )
-from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
@@ -92,10 +93,14 @@ def split_tracks(
     return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
 
 
-def unavailable_source(name: str, reason: str, remedy: str = "") -> Unavailable:
-    """Describe a missing position source; the default action is from ``px4_topics.toml``."""
-    remedy = remedy or px4.TRACKS[name].remedy
-    return Unavailable(f"position source {name}", reason, remedy, source=name)
+def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavailable:
+    """Describe a missing position source; by default its topic is not logged."""
+    return Unavailable(
+        f"position source {name}",
+        reason or f"{name} is not logged",
+        remedy or px4.TRACKS[name].remedy,
+        name,
+    )
 
 
 def make_track(
@@ -155,11 +160,13 @@ def _make_ulog_track(
     topic_names: tuple[str, ...],
     *,
     is_odometry: bool = False,
+    is_automatic: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a ULog track; ``is_odometry`` is True if its source sends a changing orientation."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, is_changing=is_odometry)
+    origin = structs.replace(origin, is_automatic=is_automatic)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
@@ -172,7 +179,7 @@ def _make_ulog_track(
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
     layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
-        return unavailable_source(name, f"{name} is not logged")
+        return unavailable_source(name)
     # Topics of EKF2 have one topic instance per EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
@@ -181,21 +188,19 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         if frame == "unknown" and field in samples and len(samples):
             frame = frame_names.get(int(samples[field].iloc[-1]), "unknown")
     if "published_us" in samples:
-        published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
-        samples["age_s"] = published_s - samples.index
+        samples["age_s"] = 1e-6 * (samples["published_us"] - topics.zero_us) - samples.index
     orientation = read_orientation(samples)
-    notes: tuple[str, ...] = ()
-    if not is_ekf2 and (count := len(topics.instances(layout.topic))) > 1:
-        notes = (
-            f"{layout.topic} has {count} instances: {count} programs publish it. px4fuse and EKF2 "
-            "use instance 0.",
-        )
+    count = len(topics.instances(layout.topic))
+    note = (
+        f"{layout.topic} has {count} instances: {count} programs publish it. px4fuse and EKF2 use "
+        "instance 0."
+    )
     return _make_ulog_track(
         topics,
         name,
         samples,
         (layout.topic,),
-        notes=notes,
+        notes=(note,) if count > 1 and not is_ekf2 else (),
         is_odometry=orientation is not None,
         frame=frame,
         clock_map=_arrival_clock_map(topics, layout.topic),
@@ -221,12 +226,10 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
         clock = _timestamp_clock(published_us, sampled_us)
         note = "timestamp_sample does not contain boot times in microseconds"
-    elif (distinct_count := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
-        return ClockMap(
-            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
-        )
     else:
-        return None
+        return clock_of_repeated_timestamps(
+            SENDER_CLOCK, len(sampled_us), len(np.unique(sampled_us))
+        )
     return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
@@ -235,66 +238,68 @@ def _timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     if not sampled_us.any():
         return "0"
     rate = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
-    units = [
-        name for name, unit_us in STAMP_UNITS.items() if abs(rate / unit_us - 1.0) < MAX_RATE_ERROR
-    ]
-    if not units:
-        return "an unknown clock"
-    stamp_s = float(np.median(sampled_us)) * STAMP_UNITS[units[0]] * 1e-6
-    if UNIX_START_S <= stamp_s < UNIX_END_S:
-        return f"UNIX time in {units[0]}"
-    return units[0] if units[0] != "microseconds" else "another clock"
+    for unit, unit_us in STAMP_UNITS.items():
+        if abs(rate / unit_us - 1.0) < MAX_RATE_ERROR:
+            if UNIX_START_S <= float(np.median(sampled_us)) * unit_us * 1e-6 < UNIX_END_S:
+                return f"UNIX time in {unit}"
+            return "another clock" if unit == "microseconds" else unit
+    return "an unknown clock"
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    layout = topics.find(px4.LAYOUTS["kept_horizontal"])
-    if layout is None:
-        return unavailable_source(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
-    samples = topics.primary_samples(layout)
-    used_topics = [layout.topic]
-    notes: tuple[str, ...] = ()
-    vertical_layout = topics.find(px4.LAYOUTS["kept_vertical"])
-    if vertical_layout is not None:
-        samples, notes = _with_height(samples, topics.primary_samples(vertical_layout))
-        used_topics.append(vertical_layout.topic)
-    # EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the sender's timestamp
-    # (estimator_interface.cpp)
-    samples = _shift_times(samples, _assumed_delay_s(topics) + 0.5 * configured_step_s(topics))
-    return _make_ulog_track(
+    horizontal, vertical = px4.LAYOUTS["kept_horizontal"], px4.LAYOUTS["kept_vertical"]
+    if topics.find(horizontal) is None:
+        return unavailable_source(px4.FUSED_OBSERVATION)
+    has_height = topics.find(vertical) is not None
+    return _make_derived_track(
         topics,
         px4.FUSED_OBSERVATION,
-        samples,
-        tuple(used_topics),
+        topics.primary_samples(horizontal),
+        topics.primary_samples(vertical) if has_height else None,
+        (horizontal.topic, vertical.topic)[: 1 + has_height],
+        # EKF2 subtracts half its prediction interval from the times (estimator_interface.cpp)
+        shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,
+    )
+
+
+def _make_derived_track(
+    topics: Topics,
+    name: str,
+    samples: pd.DataFrame,
+    height: pd.DataFrame | None,
+    topic_names: tuple[str, ...],
+    *,
+    shift_s: float = 0.0,
+    **track_fields: Any,
+) -> PositionTrack | Unavailable:
+    """Make a track from positions in EKF2's topics, each with the height nearest in time.
+
+    Height and horizontal position of a vision sample have the same timestamp, but the logger
+    decimates both topics separately. EKF2 subtracted EKF2_EV_DELAY from the sender's timestamps.
+    """
+    notes: tuple[str, ...] = ()
+    if height is not None:
+        samples = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
+        if missing_count := int(samples.pop("_found").isna().sum()):
+            notes = (
+                f"{missing_count} of {len(samples)} external vision positions have no height "
+                f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms",
+            )
+    shift_s += topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
+    return _make_ulog_track(
+        topics,
+        name,
+        _shift_times(samples, shift_s),
+        topic_names,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
+        **track_fields,
     )
 
 
 def _shift_times(samples: pd.DataFrame, shift_s: float) -> pd.DataFrame:
     return samples.set_axis(time_index(samples.index.to_numpy() + shift_s))
-
-
-def _with_height(
-    samples: pd.DataFrame, height: pd.DataFrame
-) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the height that is nearest in time to each horizontal position.
-
-    Also return a note on positions without height. Height and horizontal position of a vision
-    sample have the same timestamp, but the logger decimates both topics separately.
-    """
-    joined = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
-    missing_height_count = int(joined.pop("_found").isna().sum())
-    note = (
-        f"{missing_height_count} of {len(joined)} external vision positions have no height within "
-        f"{1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms"
-    )
-    return joined, (note,) if missing_height_count else ()
-
-
-def _assumed_delay_s(topics: Topics) -> float:
-    """Return EKF2_EV_DELAY in s, the delay from measurement to timestamp that EKF2 assumes."""
-    return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
 def _reconstruct_track(
@@ -317,18 +322,14 @@ def _reconstruct_track(
         return unavailable_source(
             px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position"
         )
-    samples = pd.DataFrame({name: positions[name] for name in Columns.POSITION[:2]})
-    notes: tuple[str, ...] = ()
-    if "down_m" in positions:
-        samples, notes = _with_height(samples, positions["down_m"].to_frame("down_m"))
-    return _make_ulog_track(
+    height = positions.pop("down_m", None)
+    return _make_derived_track(
         topics,
         px4.RECONSTRUCTION,
-        _shift_times(samples, _assumed_delay_s(topics)),
+        pd.DataFrame(positions),
+        None if height is None else height.to_frame("down_m"),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        needed_columns=Columns.POSITION[:2],
-        notes=notes,
         clock=f"time of the innovation plus {EV_POS.delay}, up to one sample interval late",
     )
 
@@ -340,8 +341,8 @@ def project(
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
-    latitude, latitude_0 = np.radians(latitude_deg), np.radians(origin[0])
-    difference = np.radians(longitude_deg) - np.radians(origin[1])
+    latitude_0, longitude_0 = np.radians(origin[:2])
+    latitude, difference = np.radians(latitude_deg), np.radians(longitude_deg) - longitude_0
     sine, cosine = np.sin(latitude), np.cos(latitude)
     sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
     cosine_difference = np.cos(difference)
@@ -358,7 +359,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
     x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
-    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
+    latitude_0, longitude_0 = np.radians(origin[:2])
     sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
     angle = np.hypot(x, y)
     # sin(c)/c, with the limit 1 at the origin
@@ -387,12 +388,12 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
     latitude and longitude 0: these samples become NaN.
     """
-    global_positions = global_positions[GLOBAL_COLUMNS].mask(
-        (global_positions[GLOBAL_COLUMNS[:2]] == 0.0).all(axis=1)
-    )
+    global_positions = global_positions[Columns.GEODETIC]
+    is_missing = (global_positions.iloc[:, :2] == 0.0).all(axis=1)
+    global_positions = global_positions.mask(is_missing)
     latitude, longitude, altitude = global_positions.to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
-    north, east = project(latitude, longitude, origin[:2])
+    north, east = project(latitude, longitude, origin)
     ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
     return pd.DataFrame(ned, index=global_positions.index)
 
@@ -406,7 +407,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
-        return unavailable_source(px4.GPS_POSITION, f"{px4.GPS_POSITION} is not logged")
+        return unavailable_source(px4.GPS_POSITION)
     gps = topics.read_instance(layout)
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= FIX_TYPE_3D]
@@ -429,7 +430,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         # Fields that unlogged fixes lack are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
-    if {"eph_m", "epv_m"} <= set(gps.columns):
+    if {"eph_m", "epv_m"} <= {*gps}:
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
@@ -451,16 +452,16 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
-    elif rate_hz < MAX_DOWNSAMPLED_HZ:
+    elif notes:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         if note:
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
             notes.append(note)
     track_fields: dict[str, Any] = {}
     # the lever arm of each receiver is logged since v1.17
-    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):
+    if {*px4.ANTENNA_COLUMNS} <= {*gps}:
         track_fields["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
-    track = _make_ulog_track(
+    return _make_ulog_track(
         topics,
         px4.GPS_POSITION,
         samples,
@@ -469,12 +470,9 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
         assumed_delay_s=delay_ms * 1e-3,
+        is_automatic=has_fused_aid(ekf2),
         **track_fields,
     )
-    if isinstance(track, PositionTrack):
-        origin = structs.replace(track.origin, is_automatic=has_fused_aid(ekf2))
-        return replace(track, origin=origin)
-    return track
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
@@ -500,38 +498,27 @@ def read_truth(
     local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
     logged_local = topics.read(local_layout)
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(global_layout), GLOBAL_COLUMNS[:2])
+    global_positions = finite_rows(topics.read(global_layout), Columns.GEODETIC[:2])
     if len(global_positions):
         projected = project_to_ned(global_positions, _local_origin(topics))
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
             return Truth(global_layout.topic, projected.join(velocity), attitude)
         if has_fused_aid(ekf2):
-            local_samples = _move_to_origin(local_samples, projected)
+            local_samples = local_samples.copy()
+            for column in Columns.POSITION:  # shift by the median difference
+                at_global = interpolate_inside(projected.index, local_samples[column])
+                shift_m = (projected[column] - at_global).median()
+                local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
-    if mocap_truth is None and len(logged_local):
-        return Unavailable(
-            "ground truth",
-            f"{local_layout.topic} has no finite sample",
-            "Check the simulation that writes the ground truth.",
-        )
-    return mocap_truth or Unavailable(
-        "ground truth",
-        "the log has neither simulation ground truth nor motion capture",
-        px4.TRACKS["vehicle_mocap_odometry"].remedy,
-    )
-
-
-def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:
-    """Shift local positions to the origin of ``global_samples`` by the median difference."""
-    moved_samples = local_samples.copy()
-    for column in Columns.POSITION:
-        local_at_global = interpolate_inside(global_samples.index, local_samples[column])
-        shift = (global_samples[column] - local_at_global).median()
-        moved_samples[column] += shift if np.isfinite(shift) else 0.0
-    return moved_samples
+    reason = "the log has neither simulation ground truth nor motion capture"
+    remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
+    if len(logged_local):
+        reason = f"{local_layout.topic} has no finite sample"
+        remedy = "Check the simulation that writes the ground truth."
+    return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
 def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:

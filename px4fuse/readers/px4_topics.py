@@ -14,7 +14,7 @@ import msgspec
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
-from px4fuse.flight.position_source import Origin, find_origin
+from px4fuse.flight.model import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 
@@ -38,7 +38,7 @@ class TrackSource:
         return find_origin(self.kind, self.path)
 
 
-_TABLE = read_toml(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
+_TABLE = read_toml(__file__, dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)

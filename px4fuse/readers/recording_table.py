@@ -19,9 +19,8 @@ import pandas as pd
 from px4fuse.core.reading import display_name, read_text
 from px4fuse.errors import LogError
 from px4fuse.readers import position_names
-from px4fuse.readers.formats import STREAM_FORMATS
 from px4fuse.readers.position_names import read_column_name
-from px4fuse.readers.text_table import decode_text, is_number, quote
+from px4fuse.readers.text_table import STREAM_FORMATS, decode_text, is_number, quote
 
 # Maximum size (bytes) of a recording: several days of UWB positions
 MAX_FILE_BYTES = 500_000_000

@@ -87,8 +87,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
     hashes = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                hashes.update(block)
+            hashlib.file_digest(stream, lambda: hashes)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             return _read_topic(name, reader, topic), hashes.hexdigest(), size

@@ -1,16 +1,33 @@
-"""Functions for text tables: decoding, numbers, and errors with the line number.
+"""Functions for text files: foreign formats, decoding, numbers, errors with the line number.
 
 Used by the readers of recordings and pose graphs (g2o).
 """
 
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.errors import TrajectoryError
+from px4fuse.core.reading import display_name
+from px4fuse.core.record import read_toml
+from px4fuse.errors import Px4FuseError, TrajectoryError
+
+_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
+# Formats of streams with positions: name, pattern of a row and pattern of the ranges
+STREAM_FORMATS = _FORMATS["streams"]
+
+
+def refuse_foreign_format(path: Path, head: bytes, error_type: type[Px4FuseError]) -> None:
+    """Raise an error with the name of the format if px4fuse does not read it."""
+    name = display_name(path)
+    for foreign_format in _FORMATS["foreign"]:
+        if any(head.startswith(start.encode("latin-1")) for start in foreign_format["starts"]):
+            remedy = foreign_format["remedy"].format(name=name)
+            raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
+
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0

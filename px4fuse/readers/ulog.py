@@ -5,7 +5,6 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.flight.ekf2_parameters import BAROMETER
-from px4fuse.flight.log import UnusedData
 from px4fuse.flight.model import (
     Columns,
     Flight,
@@ -13,6 +12,7 @@ from px4fuse.flight.model import (
     TableOrUnavailable,
     Truth,
     Unavailable,
+    UnusedData,
     time_index,
 )
 from px4fuse.readers import common

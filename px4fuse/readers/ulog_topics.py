@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,7 @@ from px4fuse.flight.ekf2_parameters import (
     REPORTED_PARAMETERS,
     replace_invalid_parameters,
 )
-from px4fuse.flight.log import Dropout, LogInfo, Stream
-from px4fuse.flight.model import ParameterChange, time_index
+from px4fuse.flight.model import Dropout, LogInfo, ParameterChange, Stream, time_index
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
@@ -43,8 +41,6 @@ MAX_PUBLICATION_LAG_S = 10.0
 # Maximum distance (s) of valid samples from the time span of the IMU data: samples further away are
 # outdated
 MAX_OUTSIDE_S = 2.0
-# Last byte of ver_sw_release in a PX4 release
-FINAL_RELEASE_TYPE = 255
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # Key of the information that a simulated log is an assignment for a student
@@ -58,23 +54,6 @@ MAX_DATA_GAP_S = 600.0
 MAX_FIELDS = 200_000
 # Length (bytes) of a ULog message header
 HEADER_BYTES = 3
-# Exceptions that pyulog may raise when it parses damaged bytes as messages
-_PARSE_ERRORS = (
-    ULogException,
-    struct.error,
-    IndexError,
-    KeyError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    UnicodeError,
-    EOFError,
-    MemoryError,
-    AssertionError,
-    RecursionError,
-)
-
 
 # Arrays of one topic instance by PX4 field name, and all topics by name and instance
 Table = dict[str, NDArray[Any]]
@@ -205,13 +184,9 @@ class Topics:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
-        if instances.empty:
-            return NO_SELECTOR
         changes = instances[instances.ne(instances.shift())]
         times = [-np.inf, *changes.index[1:]]
-        return tuple(
-            (float(switch_s), int(number)) for switch_s, number in zip(times, changes, strict=True)
-        )
+        return tuple(zip(times, changes.astype(int).tolist(), strict=False)) or NO_SELECTOR
 
     def find(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are all in the log, if any."""
@@ -243,12 +218,7 @@ class Topics:
         """
         available = self.instances(layout.topic)
         table = self.tables[layout.topic, instance if instance in available else available[0]]
-        optional_columns = {
-            column: field_name
-            for column, field_name in layout.optional.items()
-            if field_name in table
-        }
-        columns = {**layout.columns, **optional_columns}
+        columns = {**layout.columns, **layout.optional}
         time_us = measurement_time_us(table)
         kept_rows = longest_increasing_run(time_us)
         if len(kept_rows) < len(time_us):
@@ -259,16 +229,13 @@ class Topics:
                     column: table[field_name][kept_rows].astype(np.float64)
                     * layout.scale.get(column, 1.0)
                     for column, field_name in columns.items()
+                    if field_name in table
                 },
                 index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND),
             )
         samples = samples.where(np.abs(samples) < MAX_FIELD_VALUE)  # damaged values become NaN
         end_s = self.log.duration_s + MAX_OUTSIDE_S
-        return (
-            samples
-            if step
-            else samples[(samples.index >= -MAX_OUTSIDE_S) & (samples.index <= end_s)]
-        )
+        return samples if step else samples.loc[-MAX_OUTSIDE_S:end_s]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """Read the first layout whose fields are in the log, else return an empty table."""
@@ -304,10 +271,8 @@ class Topics:
         for number in available[:1] if is_single else available:
             samples = self.read_instance(layout, number, step=step)
             samples = samples if select is None else select(samples)
-            switch_index = np.searchsorted(switch_s, samples.index.to_numpy(), side="right") - 1
-            primary_frames.append(
-                samples if is_single else samples[numbers[switch_index] == number]
-            )
+            switch_index = np.searchsorted(switch_s, samples.index, side="right") - 1
+            primary_frames.append(samples[is_single | (numbers[switch_index] == number)])
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
@@ -319,9 +284,8 @@ class Topics:
             for table in self.tables_of(topics[0])
         )
         event = "measurement" if has_measurement_time else "publication"
-        self.streams[data_kind] = Stream(
-            topics, f"autopilot boot clock, time of {event}", self.log.name
-        )
+        clock = f"autopilot boot clock, time of {event}"
+        self.streams[data_kind] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
@@ -395,14 +359,13 @@ def read_topics(name: str, content: bytes) -> Topics:
         The content is not a ULog, or contains no data with valid timestamps.
     """
     content_reader = _CountingContent(content)
-    size_bytes = len(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _Reader(content_reader, message_name_filter_list=topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
             time_tables = tables or _read_tables(_Reader(_CountingContent(content)))
-    except _PARSE_ERRORS as error:
+    except Exception as error:  # pyulog raises many types for damaged bytes
         raise LogError(
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
             "Copy the .ulg from the vehicle again.",
@@ -426,7 +389,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
-        bytes=size_bytes,
+        bytes=len(content),
         format="ULog",
         firmware=_firmware_text(ulog.msg_info_dict),
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
@@ -437,13 +400,9 @@ def read_topics(name: str, content: bytes) -> Topics:
             Dropout((dropout.timestamp - zero_us) * _MICROSECOND, dropout.duration * 1e-3)
             for dropout in ulog.dropouts
         ),
-        parameters=MappingProxyType(
-            {
-                name: parameter_values[name]
-                for name in REPORTED_PARAMETERS
-                if name in parameter_values
-            }
-        ),
+        parameters={
+            name: parameter_values[name] for name in REPORTED_PARAMETERS if name in parameter_values
+        },
         parameter_defaults={
             name: value
             for name, value in sorted(ulog.get_default_parameters(0).items())
@@ -457,17 +416,13 @@ def read_topics(name: str, content: bytes) -> Topics:
         if ASSESSED_KEY in ulog.msg_info_dict and not ignores_assessed.get()
         else UNSET,
     )
-    parameters = {
-        name: value for name, value in parameter_values.items() if name.startswith("EKF2_")
-    }
-    is_truncated = content_reader.start < size_bytes < content_reader.end
     return Topics(
         log,
         tables,
         zero_us,
         {},
-        MappingProxyType(parameters),
-        is_truncated,
+        {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
+        content_reader.start < len(content) < content_reader.end,
         ulog.file_corruption,
         parameter_changes=parameter_changes,
     )
@@ -490,17 +445,16 @@ def _read_parameters(
     if landed is not None and not landed.all():
         take_off_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
     changes: list[ParameterChange] = []
+    last_values = values.copy()
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
         if not isinstance(value, int | float):
             continue
-        before, new_value = values.get(name), float(value)
-        if time_us <= take_off_us or before is None:
-            values[name] = new_value
-            continue
-        last_value = next((change.after for change in changes[::-1] if change.name == name), before)
-        if name.startswith("EKF2_") and last_value != new_value:
+        if time_us <= take_off_us or name not in values:
+            values[name] = float(value)
+        elif name.startswith("EKF2_") and last_values[name] != value:
             time_s = (time_us - zero_us) * _MICROSECOND
-            changes.append(ParameterChange(time_s, name, last_value, new_value))
+            changes.append(ParameterChange(time_s, name, last_values[name], float(value)))
+        last_values[name] = float(value)
     return values, tuple(changes)
 
 
@@ -511,15 +465,14 @@ def _read_tables(ulog: ULog) -> Tables:
     """
     tables: Tables = {}
     for subscription in ulog.data_list:
-        if "timestamp" not in subscription.data:
+        table: Table = subscription.data
+        if "timestamp" not in table:
             continue
         key = (subscription.name, subscription.multi_id)
-        table = {name: np.asarray(values) for name, values in subscription.data.items()}
-        if key in tables:
-            other_table = tables[key]
+        if other_table := tables.get(key):
             table = {
-                name: np.concatenate([other_table[name], table[name]])
-                for name in other_table
+                name: np.concatenate([values, table[name]])
+                for name, values in other_table.items()
                 if name in table
             }
             order = np.argsort(table["timestamp"], kind="stable")
@@ -556,9 +509,5 @@ def _firmware_text(info: dict[str, Any]) -> str:
         return "PX4 development version"
     # Release type in the last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255
     # release
-    suffix = (
-        ""
-        if release_type == FINAL_RELEASE_TYPE
-        else ("-dev", "-alpha", "-beta", "-rc")[release_type // 64]
-    )
+    suffix = ("-dev", "-alpha", "-beta", "-rc", "")[(release_type + 1) // 64]
     return f"{_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"

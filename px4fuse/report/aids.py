@@ -6,15 +6,15 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.core.record import Span
 from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, flight_span
-from px4fuse.findings import Finding
 from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.panels import draw_dots
-from px4fuse.report.phrases import format_sigma_verdict, write_findings
+from px4fuse.report.phrases import format_sigma_verdict
 
 TITLE = "Aiding sources of EKF2"
 LEAD_TEXT = (
@@ -27,12 +27,13 @@ MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS or optical flow."""
-    if aid_results := outdoor_aids(analysis):
-        page = Page(appendix_title(TITLE), LEAD_TEXT)
-        write_aids(page, aid_results)
-        _draw_aid_panels(page, analysis.flight, aid_results)
+def draw(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
+    """Draw EKF2's aiding sources; in a comparison only if EKF2 fused GNSS or optical flow."""
+    is_comparison = isinstance(analysis, Analysis)
+    if aids := outdoor_aids(analysis) if isinstance(analysis, Analysis) else analysis.aids:
+        page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
+        write_aids(page, aids)
+        _draw_aid_panels(page, analysis.flight, aids)
         yield page
 
 
@@ -41,20 +42,6 @@ def outdoor_aids(analysis: Analysis) -> Mapping[str, AidResult]:
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
     fused_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
     return {} if fused_names.isdisjoint(OUTDOOR_AIDS) else aids
-
-
-def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw EKF2's aiding sources of a flight without a position source."""
-    page = Page(TITLE, LEAD_TEXT)
-    write_aids(page, analysis.aids)
-    _draw_aid_panels(page, analysis.flight, analysis.aids)
-    yield page
-
-
-def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
-    write_aids(page, analysis.aids)
-    page.heading("Findings")
-    write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
@@ -88,26 +75,11 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         ] or [[""] * 5]
         for axis_cells in axis_rows:
             rows.append([*aid_cells, *axis_cells])
-            aid_cells = [""] * len(aid_cells)
-    page.table(
-        [
-            "aiding source",
-            "verdict",
-            "enabled",
-            "rejec-\nted",
-            "longest\ngap (s)",
-            "√R",
-            "axis",
-            "n",
-            "mean\nNIS",
-            "95 %\nband",
-            "mean\nν/√S",
-        ],
-        rows,
-        right_aligned_columns=(2, 3, 4, 5, 7, 8, 10),
-    )
-    disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
-    if disabled_labels:
+            aid_cells = [""] * 6
+    head = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
+    head += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
+    page.table(head, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
+    if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
         page.write(
             f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}.",
             colour=style.MUTED_COLOUR,
@@ -132,42 +104,22 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
         f"±{MAX_DRAWN_INNOVATION:g}."
     )
     for name in fused_names:
-        _draw_aid_panel(
-            page,
-            aids[name],
-            flight.ekf2.aids[name],
-            flight_span_s,
-            with_time_label=name == fused_names[-1],
-        )
+        axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, above=1.0)
+        _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
+        style.label_time_axis(axes, name == fused_names[-1])
 
 
-def _draw_aid_panel(
-    page: Page,
-    aid: AidResult,
-    aid_log: AidLog,
-    span_s: tuple[float, float],
-    *,
-    with_time_label: bool,
-) -> None:
-    samples = aid_log.samples.loc[span_s[0] : span_s[1]]
-    axes = page.panel(aid.label, "", AID_PANEL_HEIGHT, above=1.0)
-    is_fused = (
-        samples["fused"].to_numpy() > 0.0 if "fused" in samples else np.ones(len(samples), bool)
-    )
+def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
+    samples = aid_log.samples.loc[slice(*span_s)]
+    is_fused = samples["fused"] > 0.0 if "fused" in samples else pd.Series(True, samples.index)
     for axis in aid_log.axes:
-        normalised_innovations = samples[f"innovation_{axis}"] / np.sqrt(
-            samples[f"variance_{axis}"]
-        )
+        innovations = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         for is_drawn, dot_style in (
             (is_fused, style.INNOVATION_DOTS["EKF2"]),
             (~is_fused, style.REJECTED_DOTS),
         ):
-            draw_dots(
-                axes,
-                normalised_innovations[is_drawn],
-                MAX_DRAWN_INNOVATION,
-                dot_style | {"ms": 1.4},
-            )
+            dots = dot_style | {"ms": 1.4}
+            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_INNOVATION, dots)
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
@@ -187,4 +139,3 @@ def _draw_aid_panel(
         ylim=(-1.1 * MAX_DRAWN_INNOVATION, 1.1 * MAX_DRAWN_INNOVATION),
         yticks=(-2.0, 2.0),
     )
-    style.label_time_axis(axes, with_time_label)

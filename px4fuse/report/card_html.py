@@ -1,9 +1,6 @@
 """Diagnosis card as HTML, for the web pages and notebooks."""
 
 from collections.abc import Sequence
-from typing import Any
-
-from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
@@ -17,13 +14,12 @@ from px4fuse.card.model import (
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_TICKS,
-    MARKS,
     QUANTITIES,
     SEVERITY_SIGNS,
+    axis_marks,
     band_limits,
     format_spans,
     format_target,
@@ -41,7 +37,6 @@ MARK_PATHS = {
     "above": "M-5-7L7 0L-5 7z",
 }
 SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-INTERVAL_END_HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
 
 
 def card_of(analysis: Analysis) -> Card:
@@ -56,7 +51,7 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the diagnosis card as an HTML element.
+    """Return the diagnosis card as an HTML element; dir="auto" isolates names in another direction.
 
     Parameters
     ----------
@@ -90,15 +85,16 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
         verdicts=all_verdicts,
         axis=axis,
         name=name,
-        drawn=[_verdict_drawing(verdict) for verdict in all_verdicts],
+        marks=axis_marks,
+        paths=MARK_PATHS,
+        percent=_axis_percent,
         alternative=alternative_text(all_verdicts),
         ticks=[
-            (_axis_percent(tick), label, tick not in LABELLED_TICKS)
+            (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=band_limits(),
         names=FILTER_NAMES,
-        marks=MARKS,
         quantities=QUANTITIES,
         format_ratio=format_ratio,
     )
@@ -140,33 +136,7 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     return " ".join(sentences)
 
 
-def _axis_percent(ratio: float) -> str:
-    return f"{100.0 * min(max(axis_fraction(ratio), 0.0), 1.0):.2f}"
-
-
-def _verdict_drawing(verdict: Verdict) -> dict[str, Any]:
+def _axis_percent(fraction: float) -> str:
     # SVG positions are percentages, so the axis fits any width without style attributes, which the
     # security policy of the pages forbids
-    if verdict.ratio is None:
-        return {}
-    band_low, band_high = (axis_fraction(end) for end in CONSISTENT_RATIOS[verdict.against])
-    fraction = axis_fraction(verdict.ratio)
-    mark_name = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
-    interval_lines = []
-    if verdict.interval is not None:
-        left_percent, right_percent = (_axis_percent(max(end, 1e-9)) for end in verdict.interval)
-        interval_lines.append(f'x1="{left_percent}%" x2="{right_percent}%" y1="10" y2="10"')
-        end_top, end_bottom = 10 - INTERVAL_END_HALF_HEIGHT, 10 + INTERVAL_END_HALF_HEIGHT
-        interval_lines += [
-            f'x1="{x}%" x2="{x}%" y1="{end_top}" y2="{end_bottom}"'
-            for x in (left_percent, right_percent)
-        ]
-    return {
-        "band": Markup(
-            f'x="{100.0 * band_low:.2f}%" width="{100.0 * (band_high - band_low):.2f}%" '
-            'y="1" height="18"'
-        ),
-        "interval": [Markup(line) for line in interval_lines],
-        "mark": Markup(f' x="{_axis_percent(verdict.ratio)}%"'),
-        "path": MARK_PATHS[mark_name],
-    }
+    return f"{100.0 * min(max(fraction, 0.0), 1.0):.2f}%"

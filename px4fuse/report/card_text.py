@@ -5,13 +5,15 @@ import re
 import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
     FILTER_NAMES,
     MAX_NOTES,
+    RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
     Action,
     AidRow,
@@ -34,7 +36,7 @@ MAX_COMMAND_LENGTH = 74
 # σ ratios at labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
-QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
+QUANTITIES = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
     "warning": "▲ WARNING",
@@ -56,7 +58,6 @@ AIDS_HEADING = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
     "is too large. For barometer, magnetometer and gravity this is usual and not a fault."
 )
-CONSOLE_NOTE = "Console means the MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
@@ -92,14 +93,16 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield Line("No file was written. Exit code 2.")
         return
     yield from _identity_lines(card)
-    yield from _headline_and_action_lines(card)
+    yield from headline_lines(card)
+    yield from _labelled_lines("effect", card.effect_text)
+    for label, text in zip(("do this", "", ""), card.do_this, strict=False):
+        yield from _labelled_lines(label, text)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Line(title, SEVERITY_STYLES[cause.severity])
-        yield from _labelled_lines(
-            f"cause {number}" if len(card.causes) > 1 else "cause", cause.why
-        )
+        label = f"cause {number}" if len(card.causes) > 1 else "cause"
+        yield from _labelled_lines(label, cause.why)
         yield from _cause_lines(cause)
     if card.more_causes:
         yield Line(f"{card.more_causes} more causes are listed with -v")
@@ -118,23 +121,22 @@ def card_lines(card: Card) -> Iterator[Line]:
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
     """Format the first notes of a card; ``other_notes_place`` lists the other notes."""
     texts = [
-        " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
-        for note in card.notes[:MAX_NOTES]
+        f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
-    omitted_count = len(card.notes) - MAX_NOTES
-    return texts + (
-        [f"{omitted_count} more notes are listed {other_notes_place}"] if omitted_count > 0 else []
-    )
+    if (omitted_count := len(card.notes) - MAX_NOTES) > 0:
+        texts.append(f"{omitted_count} more notes are listed {other_notes_place}")
+    return texts
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
     """Yield the last lines of a card: where to find details."""
-    has_console = any(
-        action.where == "console" for cause in card.causes for _, action in marked_actions(cause)
-    )
-    sentences = ["More: -v.", *([CONSOLE_NOTE] if has_console else [])]
-    sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
-    yield from _wrapped_lines(" ".join(sentences), "", "")
+    actions = [action for cause in card.causes for _, action in marked_actions(cause)]
+    text = "More: -v."
+    if any(action.where == "console" for action in actions):
+        text += " Console means the MAVLink Console of QGroundControl."
+    if card.id:
+        text += f" Meaning: px4fuse explain {card.id}"
+    yield from _wrapped_lines(text, "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -188,11 +190,28 @@ def axis_text(ratio: float | None, reference: Reference) -> str:
     low, high = (_axis_column(end) for end in CONSISTENT_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
-        column = _axis_column(ratio)
-        is_inside = 0 <= column < AXIS_WIDTH
-        symbol = MARKS[reference] if is_inside else "▶" if column > 0 else "◀"
-        characters[min(max(column, 0), AXIS_WIDTH - 1)] = symbol
+        column, last_column = _axis_column(ratio), AXIS_WIDTH - 1
+        symbol = "◀" if column < 0 else "▶" if column > last_column else MARKS[reference]
+        characters[min(max(column, 0), last_column)] = symbol
     return "".join(characters)
+
+
+def axis_marks(
+    ratio: float, reference: Reference, interval: tuple[float, float] | None
+) -> dict[str, Any]:
+    """Return the mark, the consistent band and the 95 % interval of a σ ratio on its axis.
+
+    Places are fractions of the axis; ``mark`` is "below" or "above" for a ratio outside the axis.
+    """
+    fraction = axis_fraction(ratio)
+    return {
+        "fraction": fraction,
+        "mark": "below" if fraction < 0.0 else "above" if fraction > 1.0 else reference,
+        "band": [axis_fraction(end) for end in CONSISTENT_RATIOS[reference]],
+        "interval": [
+            axis_fraction(float(np.clip(end, *RATIO_AXIS_ENDS))) for end in interval or ()
+        ],
+    }
 
 
 def _axis_column(ratio: float) -> int:
@@ -203,7 +222,7 @@ def _identity_lines(card: Card) -> Iterator[Line]:
     identity = card.identity
     flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
-    yield Line(f"{identity.file}  {flight_text}{f'  {student_text}' if student_text else ''}")
+    yield Line("  ".join(filter(None, (identity.file, flight_text, student_text))))
     if identity.settings:
         yield from _wrapped_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
@@ -217,13 +236,6 @@ def headline_lines(card: Card) -> Iterator[Line]:
     label = "ok" if card.severity == "clean" else card.severity
     name = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{name}: {card.headline}", SEVERITY_STYLES[card.severity])
-
-
-def _headline_and_action_lines(card: Card) -> Iterator[Line]:
-    yield from headline_lines(card)
-    yield from _labelled_lines("effect", card.effect_text)
-    for place, text in enumerate(card.do_this):
-        yield from _labelled_lines("" if place else "do this", text)
 
 
 def _cause_lines(cause: Cause) -> Iterator[Line]:
@@ -278,33 +290,26 @@ def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
     """Return the columns of the table of re-runs with their headings; empty columns are omitted."""
-    columns = (
-        ("re-run of this log", [rerun.label for rerun in reruns]),
-        (
-            "position RMSE",
-            [_before_after_text(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
-        ),
-        (
-            "● innovation ÷ √S",
-            [_before_after_text(rerun.source_ratio, format_ratio) for rerun in reruns],
-        ),
-        ("◆ error ÷ σ", [_before_after_text(rerun.truth_ratio, format_ratio) for rerun in reruns]),
-        (
-            "rejected",
-            [
-                _before_after_text(rerun.rejected_fraction, _format_percent, " %")
-                for rerun in reruns
-            ],
-        ),
-        ("improves", [rerun.improves for rerun in reruns]),
-    )
-    return [(head, *cells) for head, cells in columns if any(cells)]
+    rows = [
+        {
+            "re-run of this log": rerun.label,
+            "position RMSE": _before_after_text(rerun.position_rmse_m, format_metres, " m"),
+            "● innovation ÷ √S": _before_after_text(rerun.source_ratio, format_ratio),
+            "◆ error ÷ σ": _before_after_text(rerun.truth_ratio, format_ratio),
+            "rejected": _before_after_text(rerun.rejected_fraction, _format_percent, " %"),
+            "improves": rerun.improves,
+        }
+        for rerun in reruns
+    ]
+    heads = rows[0] if rows else ()
+    columns = [(head, *(row[head] for row in rows)) for head in heads]
+    return [column for column in columns if any(column[1:])]
 
 
 def rerun_note(reruns: Sequence[Rerun]) -> str:
-    starts_s = {
+    starts_s = [
         rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
-    }
+    ]
     if not starts_s:
         return ""
     return (
@@ -332,22 +337,17 @@ def _verdict_axis_lines(card: Card) -> Iterator[Line]:
     yield Line("")
     heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
     yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
-    legend = f"  ░ consistent ({band_limits()})"
-    side_labels = (
-        f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
-    )
-    yield Line(f"{'':{AXIS_INDENT}}{side_labels}")
+    legend, side_label = f"  ░ consistent ({band_limits()})", "σ too large"
+    yield Line(f"{'':{AXIS_INDENT}}{side_label}{'σ too small':>{AXIS_WIDTH - len(side_label)}}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Line("  Verdicts in brackets are not faults of the filter: the causes explain them.")
-    for verdict in card.verdicts:
-        yield _verdict_line(verdict)
+    yield from map(_verdict_line, card.verdicts)
 
 
 def _verdict_line(verdict: Verdict) -> Line:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
-    label_text = f"  {filter_label:4} {quantity:25}"
+    label_text = f"  {filter_label:4} {QUANTITIES[verdict.against]:25}"
     if verdict.ratio is None:
         text = f"{'–':>7}  not evaluated: {verdict.reason}"
         return Line(text, "", label_text, " " * 41, wraps=True)
@@ -373,10 +373,8 @@ def _aid_axis_lines(aids: Sequence[AidRow]) -> Iterator[Line]:
     yield from _wrapped_lines(AIDS_HEADING, "", "  ")
     indent = 31
     yield Line(f"{'':{indent}}{_ticks_line()}")
-    previous_label = ""
-    for row in aids:
-        label = row.label if row.label != previous_label else ""
-        previous_label = row.label
+    for row, previous_row in zip(aids, (None, *aids), strict=False):
+        label = "" if previous_row and row.label == previous_row.label else row.label
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
         label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
         yield Line(f"{label_text:{indent}}{axis_text(row.ratio, 'source')}")

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
 from px4fuse.convention.correction import convention_faults
 from px4fuse.filter.time_offset import ClockOffset
@@ -38,7 +38,9 @@ def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     return not clock.is_determinable or any(finding.id in CLOCK_FINDINGS for finding in findings)
 
 
-def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
+def clock_advice(
+    comparison: PreparedComparison, clock: ClockOffset | Unavailable
+) -> dict[str, str]:
     """Return sentences on the time offset of the position source, and their labels as keys."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
@@ -67,10 +69,8 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
         )
         advice["Changes"] = f"The offset changes during the flight: {offset_texts}."
-    source = comparison.source
-    if clock_drift := convention_faults(
-        comparison.convention, comparison.flight, source.frame
-    ).clock_drift:
+    faults = convention_faults(comparison.convention, comparison.flight, comparison.source.frame)
+    if clock_drift := faults.clock_drift:
         advice["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "
             f"{'fast' if clock_drift > 0.0 else 'slow'}. The offset applies to the middle of the "
@@ -86,21 +86,18 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     return advice
 
 
-def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
-    delay_parameter, ml_delay_ms = (
-        aid_of(comparison).delay,
-        wrong_delay_ms(comparison, clock, flown_ms),
-    )
+def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, flown_ms: float) -> str:
+    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
     if ml_delay_ms is None:
-        return f"{delay_parameter} {flown_ms:g} ms agrees with the estimate."
-    if limit_text := delay_limit(delay_parameter, ml_delay_ms, flown_ms):
+        return f"{name} {flown_ms:g} ms agrees with the estimate."
+    if limit_text := delay_limit(name, ml_delay_ms, flown_ms):
         return (
-            f"The maximum-likelihood {delay_parameter} is {ml_delay_ms:.0f} ms, but "
-            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
+            f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot "
+            f"{limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {delay_parameter} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or "
-        "correct the sender's clock."
+        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or correct the "
+        "sender's clock."
     )
 
 
@@ -124,7 +121,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         "so it is wider than the curve shows."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
-    draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
+    draw_curve(page.panel(title, CURVE_HEIGHT, caption=curve_sentence, above=14.0), clock)
     yield page
 
 
@@ -136,10 +133,10 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DRAWN_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
     half_width_s = PLOT_HALF_WIDTH_INTERVALS * max(high_s - estimate_s, estimate_s - low_s)
-    curve_ends_s = clock.curve_s[0], clock.curve_s[-1]
+    margin_s = 0.1 * half_width_s
     axes.set_xlim(
-        min(max(estimate_s - half_width_s, curve_ends_s[0]), applied_s - 0.1 * half_width_s),
-        max(min(estimate_s + half_width_s, curve_ends_s[1]), applied_s + 0.1 * half_width_s),
+        min(max(estimate_s - half_width_s, clock.curve_s[0]), applied_s - margin_s),
+        max(min(estimate_s + half_width_s, clock.curve_s[-1]), applied_s + margin_s),
     )
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

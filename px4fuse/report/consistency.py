@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary, UntestedFilter
+from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
@@ -18,14 +18,14 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_fraction
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Cell, Page, draw_legend_above, two_columns
+from px4fuse.report.page import Page, draw_legend_above, two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
     VERDICT_TABLE_HEAD,
     filters_by_name,
     format_noise_estimate,
     format_settings,
-    verdict_rows,
+    verdict_cells,
 )
 from px4fuse.report.style import (
     INNOVATION_DOTS,
@@ -71,42 +71,35 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     series = _tested_innovations(result)
     if series:
-        axes = event_marks.panel(
-            page,
-            analysis,
-            "Running mean NIS (log scale)",
-            "",
-            RUNNING_NIS_HEIGHT,
-            above=LEGEND_HEIGHT,
-        )
-        _draw_running_nis(axes, series)
-        draw_legend_above(axes)
+        title = "Running mean NIS (log scale)"
+        axes = event_marks.panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
         left_page, right_page = two_columns()
         left = left_page.panel(
-            "Distribution of ν/√S", "", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
+            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
         right = right_page.panel(
             "Autocorrelation",
-            _whiteness_sentence(result, series),
             DISTRIBUTION_HEIGHT,
+            caption=_whiteness_sentence(result, series),
             above=LEGEND_HEIGHT,
         )
+        _draw_running_nis(axes, series)
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
-        for axes in (left, right):
-            draw_legend_above(axes)
+        for labelled_axes in (axes, left, right):
+            draw_legend_above(labelled_axes)
         page.add_columns(left_page, right_page)
     else:
-        kf_summary = result.filters["kf"]
-        reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
+        reason = getattr(result.filters["kf"], "reason", "too few innovations")
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes")
     head = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
-    page.table(
-        head,
-        verdict_rows(analysis.axes.values(), _statistic_cells),
-        right_aligned_columns=(2, 5, 6, 7, 8),
-    )
+    rows = [
+        [*verdict_cells(axis_result, name), *_statistic_cells(consistency)]
+        for axis_result in analysis.axes.values()
+        for name, consistency in filters_by_name(axis_result).items()
+    ]
+    page.table(head, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()
@@ -130,19 +123,13 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
         cause = find_cause(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
             tested_trials.append((cause, "difference"))
-    rows: list[list[Cell]] = []
+    rows = []
     for trial, statistic in tested_trials:
         label, power = STATISTIC_LABELS_AND_POWERS[statistic]
-        values = (outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after))
-        rows.append(
-            [
-                trial.filter.upper(),
-                format_change(analysis, trial),
-                label,
-                *(format_number(value**power, 2) for value in values),
-                format_explained_fraction(trial, statistic),
-            ]
-        )
+        values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
+        cells = [trial.filter.upper(), format_change(analysis, trial), label]
+        cells += [format_number(value**power, 2) for value in values]
+        rows.append([*cells, format_explained_fraction(trial, statistic)])
     if not rows:
         return
     page.heading(f"Tested causes along {axis.label}")
@@ -181,26 +168,21 @@ def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
         axes.plot(drawn_times_s, band_low, **_thin_line_style(name))
         axes.plot(drawn_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
         settled_nis = running_nis.iloc[len(running_nis) // 4 :]
-        lowest_nis, highest_nis = (
-            min(lowest_nis, 0.7 * settled_nis.min()),
-            max(highest_nis, 1.4 * settled_nis.max()),
-        )
+        lowest_nis = min(lowest_nis, 0.7 * settled_nis.min())
+        highest_nis = max(highest_nis, 1.4 * settled_nis.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest_nis, highest_nis))
-    set_plain_ticks(axes.yaxis)
+    set_plain_ticks(axes)
 
 
 def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
-    normalised_innovation = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
-    normal_density = np.exp(-0.5 * normalised_innovation**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(normalised_innovation, normal_density, color="#dcdcdc", lw=0, label="normal")
+    innovations = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
+    normal_density = np.exp(-0.5 * innovations**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(innovations, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in series.items():
-        density, _ = np.histogram(
-            values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION),
-            bins=HISTOGRAM_EDGES,
-            density=True,
-        )
+        drawn_values = values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
+        density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
         axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
         density_limit = max(density_limit, float(density.max()))
     axes.set_xlim(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
@@ -215,11 +197,8 @@ def _draw_autocorrelation(axes: Axes, series: InnovationSeries) -> None:
         correlations = autocorrelation(np.asarray(values, np.float64), lag_count)
         lag_positions = np.arange(1, lag_count + 1) + shift
         axes.vlines(lag_positions, 0.0, correlations, color=TRACK_LINES[name]["color"], lw=1.2)
-        dots = INNOVATION_DOTS[name] | {
-            "ms": 3.0,
-            "mew": 0.6,
-            "mfc": KF_COLOUR if name == "KF" else "white",
-        }
+        fill_colour = KF_COLOUR if name == "KF" else "white"
+        dots = INNOVATION_DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
         half_band = _whiteness_half_band(values)
         axes.axhline(-half_band, **_thin_line_style(name))
@@ -254,9 +233,7 @@ def _whiteness_sentence(result: AxisComparison, series: InnovationSeries) -> str
     return "\n".join(sentences)
 
 
-def _statistic_cells(
-    _: AxisComparison, __: str, consistency: FilterSummary | UntestedFilter
-) -> list[str]:
+def _statistic_cells(consistency: Consistency | Unavailable) -> list[str]:
     if isinstance(consistency, Unavailable):
         return [""] * 5
     return [

@@ -16,14 +16,14 @@ from px4fuse.card.model import (
     axis_fraction,
 )
 from px4fuse.core.text import format_ratio
-from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
+from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_HEADING,
-    MARKS,
     MAX_COMMAND_LENGTH,
     QUANTITIES,
     SEVERITY_SIGNS,
+    axis_marks,
     band_limits,
     format_spans,
     marked_actions,
@@ -37,9 +37,9 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
+FlightResults = ComparisonResults | AidsResults
+
 MAX_FILE_NAME_LENGTH = 56  # maximum number of characters of the file name in the head
-RATIO_AXIS_TITLE = "Is the reported uncertainty right?"
-RATIO_AXIS_TEXT = "RMS of actual error ÷ reported σ"
 TERMS_NOTE = (
     "Source: positions that KF and EKF2 fuse. σ and √S: standard deviations of position and "
     "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "
@@ -50,30 +50,19 @@ PLACE_NAMES = {"shell": "your computer", "console": "MAVLink Console of QGroundC
 ALL_FINDINGS = "All findings"
 
 
-def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots in the space below it."""
+def draw(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+    """Draw the cover: the diagnosis card, and plots of a comparison in the space below it."""
     page = Page()
     block = add_card(page, results.card)
-    write_panels(block, analysis, results.card, free_height(page))
-    yield page
-
-
-def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
-    """Draw the cover of a flight without a position source."""
-    page = Page()
-    add_card(page, results.card)
+    if isinstance(analysis, Analysis):
+        write_panels(block, analysis, results.card, free_height(page))
     yield page
 
 
 def add_card(page: Page, card: Card) -> Block:
     """Add a diagnosis card to a page."""
-    identity = card.identity
-    flight_texts = (
-        identity.firmware,
-        identity.hardware,
-        f"{identity.duration_s:.1f} s",
-        identity.source,
-    )
+    identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
+    flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
     more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
     return page.add(
         "cover",
@@ -115,21 +104,20 @@ def _shorten_middle(name: str) -> str:
     >>> _shorten_middle("2026-04-02_14-13-00_" + "x" * 60 + "_issue.ulg")
     '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxxx_issue.ulg'
     """
+    if len(name) <= MAX_FILE_NAME_LENGTH:
+        return name
     half_length = MAX_FILE_NAME_LENGTH // 2
-    return (
-        name
-        if len(name) <= MAX_FILE_NAME_LENGTH
-        else f"{name[: half_length - 1]}…{name[-half_length:]}"
-    )
+    return f"{name[: half_length - 1]}…{name[-half_length:]}"
 
 
 def _axis_data(card: Card) -> dict[str, Any]:
     interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
     ends_text = " and ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     direction_text = f", {card.effect.axis}" if card.effect else ""
+    axis_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return {
-        "axis_title": RATIO_AXIS_TITLE,
-        "axis_text": AIDS_HEADING if card.aids else f"{RATIO_AXIS_TEXT}{direction_text}",
+        "axis_title": "Is the reported uncertainty right?",
+        "axis_text": AIDS_HEADING if card.aids else axis_text,
         "axis_legend": (
             f"grey: consistent ({band_limits()}){interval_legend} · ◀ ▶ outside {ends_text}"
         ),
@@ -142,19 +130,17 @@ def _axis_data(card: Card) -> dict[str, Any]:
 
 
 def _verdict_row_data(verdict: Verdict) -> dict[str, Any]:
-    label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
     verdict_text = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
     if verdict.ratio is None:
         verdict_text = f"not evaluated: {verdict.reason}"
     return {
         "filter": verdict.filter,
-        "label": label,
-        "quantity": quantity,
+        "label": FILTER_NAMES[verdict.filter] if verdict.against == "source" else "",
+        "quantity": QUANTITIES[verdict.against],
         "word": verdict_text,
         "quiet": verdict.is_explained,
         "loud": verdict.is_fault,
-        **_ratio_marks(verdict.ratio, verdict.against, verdict.interval),
+        **_ratio_data(verdict.ratio, verdict.against, verdict.interval),
     }
 
 
@@ -166,29 +152,16 @@ def _aid_row_data(row: AidRow) -> dict[str, Any]:
         "word": "not evaluated" if row.ratio is None else "",
         "quiet": row.is_usual,
         "loud": False,
-        **_ratio_marks(row.ratio, "source", None),
+        **_ratio_data(row.ratio, "source", None),
     }
 
 
-def _ratio_marks(
+def _ratio_data(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    fraction = 0.5 if ratio is None else axis_fraction(ratio)
-    side_outside = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
-    return {
-        "ratio": "" if ratio is None else format_ratio(ratio),
-        "shape": "circle" if reference == "source" else "diamond",
-        "fraction": fraction,
-        "beyond": side_outside,
-        "band": [axis_fraction(end) for end in CONSISTENT_RATIOS[reference]],
-        "interval": None
-        if interval is None or side_outside
-        else list(map(_clipped_axis_fraction, interval)),
-    }
-
-
-def _clipped_axis_fraction(ratio: float) -> float:
-    return min(max(axis_fraction(max(ratio, RATIO_AXIS_ENDS[0])), 0.0), 1.0)
+    if ratio is None:
+        return {"ratio": ""}
+    return {"ratio": format_ratio(ratio), **axis_marks(ratio, reference, interval)}
 
 
 def _causes_legend(causes: Sequence[Cause]) -> str:

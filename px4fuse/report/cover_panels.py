@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import FILTER_NAMES, Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
-from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.comparison.model import FILTERS, AxisComparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
@@ -142,11 +143,16 @@ def _draw_plots(
     for plot, height in zip(plots, heights, strict=True):
         is_last = plot is plots[-1]
         axes_height = height - _title_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
-        axes = page.panel(plot.title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
+        axes = _add_panel(page, plot.title, axes_height)
         event_marks.draw_marks(axes, analysis)
-        axes.locator_params(axis="x", nbins=_tick_count(page))
         plot.draw(axes)
         style.label_time_axis(axes, is_last)
+
+
+def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
+    axes = page.panel(title, axes_height, left=LEFT_MARGIN, is_compact=True)
+    axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE_PLOT_WIDTH else 4)
+    return axes
 
 
 def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[float]:
@@ -154,10 +160,6 @@ def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[
     title_heights = [_title_height(page, plot.title) for plot in plots]
     axes_height = (total - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
-
-
-def _tick_count(page: Page) -> int:
-    return 6 if page.width > MIN_WIDE_PLOT_WIDTH else 4
 
 
 def _title_height(page: Page, title: str) -> float:
@@ -179,7 +181,7 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         return [
             _error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
-                _format_lengths("RMSE", rmse_m.get(filter_name)),
+                ("RMSE", rmse_m.get(filter_name)),
                 errors["error_m"],
                 {name: errors["sigma_m"]},
                 half_range_m,
@@ -199,21 +201,19 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     }
     limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
     half_range_m = 1.1 * max(float(difference_m.abs().max()), *limits_m)
-    size_texts = _format_lengths("RMS", effect.difference_rms_m if effect else None)
-    return [_error_plot("KF − EKF2 (m)", size_texts, difference_m, sigmas_m, half_range_m)]
-
-
-def _format_lengths(label: str, length_m: float | None) -> list[str]:
-    return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
+    rms = ("RMS", effect.difference_rms_m if effect else None)
+    return [_error_plot("KF − EKF2 (m)", rms, difference_m, sigmas_m, half_range_m)]
 
 
 def _error_plot(
     label: str,
-    size_texts: list[str],
+    size: tuple[str, float | None],
     error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
+    size_name, length_m = size
+    texts = [] if length_m is None else [f"{size_name} {format_metres(length_m)}"]
     known_sigmas = {
         name: known for name, sigma in sigmas.items() if not (known := sigma.dropna()).empty
     }
@@ -222,7 +222,7 @@ def _error_plot(
         for name, sigma in known_sigmas.items()
     ]
     if sigma_texts:
-        size_texts = [*size_texts, f"σ {', '.join(sigma_texts)}"]
+        texts.append(f"σ {', '.join(sigma_texts)}")
     line = TRACK_LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
@@ -232,7 +232,7 @@ def _error_plot(
         axes.axhline(0.0, color="black", lw=0.5)
         draw_curve(axes, error_m, **line)
 
-    return TimePlot(f"{label}: {', '.join(size_texts)}", draw)
+    return TimePlot(f"{label}: {', '.join(texts)}", draw)
 
 
 def _error_range_m(errors: pd.DataFrame) -> float:
@@ -283,10 +283,9 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
         return segment_track["north_m"].to_numpy(), segment_track["east_m"].to_numpy()
 
     tracks = {"positions": cut(analysis.source.samples)}
-    if {"north", "east"} <= analysis.axes.keys():
-        north, east = (
-            analysis.axes[name].replay.steps["position_m"].to_numpy() for name in ("north", "east")
-        )
+    results = north_and_east(analysis)
+    if len(results) == 2:
+        north, east = (result.replay.steps["position_m"].to_numpy() for result in results)
         tracks["KF"] = north, east
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut(flight.ekf2.state)
@@ -297,10 +296,12 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map with the main axis to the right; without a main axis, north is up."""
-    aisle_axis = next((line for line in analysis.lines if line.name == AISLE), None)
+    aisle_heading_deg = next(
+        (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
+    )
     heading_rad, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
-    if aisle_axis is not None and aisle_axis.heading_deg is not None:
-        heading_rad, up_label = np.deg2rad(aisle_axis.heading_deg % 180.0), "left (m)"
+    if aisle_heading_deg is not None:
+        heading_rad, up_label = np.deg2rad(aisle_heading_deg % 180.0), "left (m)"
         axis = card.effect.axis if card.effect else "along the aisle"
         right_labels = [f"{text} (m)" for text in (axis, axis.partition(", ")[2], "main axis")]
     elif analysis.source.frame == "FRD":
@@ -318,27 +319,23 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT
     title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
     limits = _map_limits(tracks, width / axes_height)
-    distances_m = {
-        name: np.nanmax(np.abs(track - np.clip(track, *limits)))
-        for name, track in ((name, np.transpose(track)) for name, track in tracks.items())
-    }
-    distance_texts = [
-        f"{name} {format_metres(distance_m)} m"
-        for name, distance_m in distances_m.items()
-        if distance_m > 0.0
-    ]
+    distance_texts = []
+    for name, coordinates in tracks.items():
+        track = np.transpose(coordinates)
+        distance_m = np.nanmax(np.abs(track - np.clip(track, *limits)))
+        if distance_m > 0.0:
+            distance_texts.append(f"{name} {format_metres(distance_m)} m")
     if distance_texts:
         title = f"Map; largest distance outside the map: {', '.join(distance_texts)}"
         axes_height = height - _title_height(page, title) - HEIGHT_BELOW_AXES[True]
         limits = _map_limits(tracks, width / axes_height)
-    axes = page.panel(title, "", axes_height, left=LEFT_MARGIN, is_compact=True)
+    axes = _add_panel(page, title, axes_height)
     right_label = next(
         text for text in flight_map.right_labels if text_width(text) < page.width - LEFT_MARGIN
     )
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.locator_params(axis="x", nbins=_tick_count(page))
     axes.grid(True, axis="both")
     for name, (right_m, up_m) in tracks.items():
         if name == "positions":
@@ -352,12 +349,9 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         (analysis.events.take_off_s, event_marks.TAKE_OFF_MARK),
         (analysis.events.landing_s, event_marks.LANDING_MARK),
     ):
-        nearest_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
-        axes.plot(
-            right_m[nearest_rows],
-            up_m[nearest_rows],
-            **mark | {"ms": 9.0, "mec": "white", "mew": 0.8},
-        )
+        rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
+        large_mark = mark | {"ms": 9.0, "mec": "white", "mew": 0.8}
+        axes.plot(right_m[rows], up_m[rows], **large_mark)
 
 
 def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple[Array, Array]:
@@ -368,15 +362,17 @@ def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple
         ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
             ends_m.append(_range_of(tracks["ground truth"][axis_index]))
-        margin_m = MAX_MAP_MARGIN * (np.max(ends_m) - np.min(ends_m))
-        limits_m = np.min(ends_m) - margin_m, np.max(ends_m) + margin_m
+        low_m, high_m = _range_of(ends_m)
+        margin_m = MAX_MAP_MARGIN * (high_m - low_m)
+        limits_m = low_m - margin_m, high_m + margin_m
         ends_m += [np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()]
-        middles_m.append(0.5 * (np.min(ends_m) + np.max(ends_m)))
-        sizes_m.append(max(MAP_MARGIN * (np.max(ends_m) - np.min(ends_m)), MIN_MAP_LENGTH_M))
+        low_m, high_m = _range_of(ends_m)
+        middles_m.append(0.5 * (low_m + high_m))
+        sizes_m.append(max(MAP_MARGIN * (high_m - low_m), MIN_MAP_LENGTH_M))
     length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
     half_size = 0.5 * np.array([length_m, length_m / aspect_ratio])
     return np.array(middles_m) - half_size, np.array(middles_m) + half_size
 
 
-def _range_of(values: Array) -> Array:
+def _range_of(values: ArrayLike) -> Array:
     return np.array([np.nanmin(values), np.nanmax(values)])

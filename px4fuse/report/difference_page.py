@@ -33,15 +33,13 @@ LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
 TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over time
 # Style of the bar of a replaced setting that increases the difference KF - EKF2
-INCREASE_BAR_STYLE = {"color": "white", "hatch": "////"}
+INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the contribution of each EKF2 setting to the difference KF - EKF2."""
     explanations = _axis_explanations(analysis)
-    if not any(
-        isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
-    ):
+    if not _has_explanation(explanations):
         return
     page = Page(
         TITLE,
@@ -68,6 +66,10 @@ def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
+def _has_explanation(explanations: Mapping[str, DifferenceExplanation | Unavailable]) -> bool:
+    return any(isinstance(entry, DifferenceExplanation) for entry in explanations.values())
+
+
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
     """Write the explanation of the difference KF - EKF2, or the reason why it is missing."""
     if isinstance(explanation, Unavailable):
@@ -80,14 +82,12 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 def unexplained_note(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
-    explanations = list(_axis_explanations(analysis).values())
-    if isinstance(analysis.flight.ekf2, Unavailable) or any(
-        isinstance(explanation, DifferenceExplanation) for explanation in explanations
-    ):
+    explanations = _axis_explanations(analysis)
+    if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanations):
         return ""
     reasons = {
         f"{explanation.reason}. {explanation.remedy}": None
-        for explanation in explanations
+        for explanation in explanations.values()
         if isinstance(explanation, Unavailable)
     }
     return f"The difference KF - EKF2 is not explained: {' '.join(reasons)}" if reasons else ""
@@ -95,13 +95,12 @@ def unexplained_note(analysis: Analysis) -> str:
 
 def format_agreement(agreement: Agreement) -> str:
     """Format the agreement of the EKF2 replay with the log."""
-    axes = agreement.axes.items()
     correlation_text = ", ".join(
-        f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes
+        f"{axis.innovation_correlation:.4f} ({name})" for name, axis in agreement.axes.items()
     )
     ratio_text = ", ".join(
         f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
-        for _, axis in axes
+        for axis in agreement.axes.values()
     )
     return (
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
@@ -129,33 +128,25 @@ def _draw_axis(
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
     )
-    for column, left_edge, (quantity, unit, squared_unit, unexplained_mean_square) in zip(
+    for column, left_edge, (quantity, unit, squared_unit, unexplained) in zip(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
-        total_mean_square = getattr(explanation, f"{quantity}_mean_square_{squared_unit}")
-        mean_square_reductions = np.array(
-            [getattr(step, f"{quantity}_mean_square_{squared_unit}") for step in explanation.steps]
-        )
-        title, height = (
-            f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS",
-            BAR_ROW_HEIGHT * (len(setting_names) + 2),
-        )
-        axes = column.panel(title, "", height, left=left_edge)
-        _draw_waterfall(
-            axes,
-            setting_names,
-            100.0 * mean_square_reductions / total_mean_square,
-            100.0 * unexplained_mean_square / total_mean_square,
-        )
+        field = f"{quantity}_mean_square_{squared_unit}"
+        total = getattr(explanation, field)
+        reductions = np.array([getattr(step, field) for step in explanation.steps])
+        title = f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS"
+        height = BAR_ROW_HEIGHT * (len(setting_names) + 2)
+        axes = column.panel(title, height, left=left_edge)
+        percents = 100.0 * reductions / total, 100.0 * unexplained / total
+        _draw_waterfall(axes, setting_names, *percents)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    title = "Position difference KF - EKF2 (m, dark) and unexplained difference (light)"
     axes = event_marks.panel(
         page,
         analysis,
-        title,
-        _largest_difference_sentence(explanation),
+        "Position difference KF - EKF2 (m, dark) and unexplained difference (light)",
         TIME_PLOT_HEIGHT,
+        caption=_largest_difference_sentence(explanation),
         axis=name,
     )
     position_difference, unexplained_difference = (
@@ -173,23 +164,16 @@ def _draw_waterfall(
     """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions_percent)])
     row_count, right_end = len(setting_names) + 2, max(100.0, float(bar_ends.max()))
-    bar_style: dict[str, Any] = {
-        "height": 0.7,
-        "edgecolor": KF_COLOUR,
-        "lw": 0.6,
-        "color": KF_COLOUR,
-    }
-    axes.barh(0, 100.0, **bar_style)
+    kf_bar: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}
+    axes.barh(0, 100.0, **kf_bar, color=KF_COLOUR)
     for row, (reduction, bar_start) in enumerate(
         zip(reductions_percent, bar_ends, strict=False), start=1
     ):
-        bar_style |= (
-            {"color": KF_BAND_COLOUR, "hatch": ""} if reduction >= 0.0 else INCREASE_BAR_STYLE
-        )
-        axes.barh(row, -reduction, left=bar_start, **bar_style)
+        bar_style = INCREASE_BAR_STYLE if reduction < 0.0 else {"color": KF_BAND_COLOUR}
+        axes.barh(row, -reduction, left=bar_start, **kf_bar, **bar_style)
         axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
-    bar_style |= {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR, "hatch": ""}
-    axes.barh(row_count - 1, unexplained_percent, **bar_style)
+    ekf2_bar = kf_bar | {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR}
+    axes.barh(row_count - 1, unexplained_percent, **ekf2_bar)
     for row, percent in enumerate((100.0, *reductions_percent, unexplained_percent)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
         axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
@@ -201,9 +185,10 @@ def _draw_waterfall(
 
 
 def _largest_difference_sentence(explanation: DifferenceExplanation) -> str:
-    largest_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
+    differences_m = np.abs(explanation.kf_minus_ekf2_m)
+    row = int(np.argmax(differences_m))
     return (
-        f"Largest difference KF - EKF2: {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
-        f"{explanation.times_s[largest_row]:.1f} s; unexplained RMS "
+        f"Largest difference KF - EKF2: {differences_m[row]:.2g} m at "
+        f"{explanation.times_s[row]:.1f} s; unexplained RMS "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

@@ -39,17 +39,6 @@ STATISTIC_LINES = (
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
 )
 NEGLIGIBLE_ERROR_M = 1e-6  # maximum position error (m) that rounding can cause
-ERROR_TABLE_HEAD = (
-    "error",
-    "RMSE",
-    "95 %",
-    "mean",
-    "median",
-    "std",
-    "max",
-    "n",
-    "rotation\nRMSE (°)",
-)
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -73,19 +62,18 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     left, right = two_columns()
     unaligned_handles: dict[str, Artist] = {}
     if is_aligned:
-        axes = left.panel("Before alignment", "", MAP_HEIGHT, left=LABEL_MARGIN)
+        axes = left.panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
         for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            plot_path(
-                axes, position_m[:, axis_indices], evaluation.time_s, label=label, **line_style
-            )
+            drawn_m = position_m[:, axis_indices]
+            plot_path(axes, drawn_m, evaluation.time_s, label=label, **line_style)
         style.set_map_axes(axes, *names)
         unaligned_handles = _legend_handles(axes)
         left.write_small(unaligned_sentence(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right.panel(title, "", MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
+    axes = right.panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
     right.write_small("Darker poses have a larger error; × marks the largest one.")
@@ -124,17 +112,17 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
 
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     left, right = two_columns()
-    axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
+    axes = left.panel("APE over time (m)", PANEL_HEIGHT)
     origin_s = time_origin_s(evaluation)
     label = "time from the first pose (s)" if origin_s else "time (s)"
     draw_ape(axes, evaluation, evaluation.time_s - origin_s, label)
     page.legend(axes.get_legend_handles_labels()[0])
-    axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
+    axes = right.panel("APE over distance (m)", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     page.add_columns(left, right)
     if _rpe_statistics(evaluation):
         left, right = two_columns()
-        _draw_rpe(left.panel("RPE for each delta (m)", "", PANEL_HEIGHT), evaluation)
+        _draw_rpe(left.panel("RPE for each delta (m)", PANEL_HEIGHT), evaluation)
         right.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
         page.add_columns(left, right)
 
@@ -144,12 +132,8 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
     error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
     drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_POINTS)
     gap_indices = np.searchsorted(drawn_x, x_values[_gap_indices(evaluation.time_s)])
-    axes.plot(
-        np.insert(drawn_x, gap_indices, np.nan),
-        np.insert(drawn_errors_m, gap_indices, np.nan),
-        color=KF_COLOUR,
-        lw=0.8,
-    )
+    curve = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
+    axes.plot(*curve, color=KF_COLOUR, lw=0.8)
     for name, title, line_style in STATISTIC_LINES:
         value = getattr(evaluation.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
@@ -165,8 +149,8 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    shown_indices = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_RPE_DELTA_LABELS)
-    axes.set_xticks(shown_indices, [rpe_statistics[index][0].delta_text for index in shown_indices])
+    ticks = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_RPE_DELTA_LABELS)
+    axes.set_xticks(ticks, [rpe_statistics[index][0].delta_text for index in ticks])
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta: distance, time or number of frames")
@@ -178,24 +162,17 @@ def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statist
 
 def _gap_indices(time_s: Array) -> IntArray:
     intervals_s = np.diff(time_s)
-    return np.asarray(
-        np.flatnonzero(intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)) + 1
-    )
+    is_gap = intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)
+    return np.asarray(np.flatnonzero(is_gap) + 1)
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with gaps where the time has gaps."""
-    gap_indices = _gap_indices(time_s)
-    evenly_spaced = np.linspace(
-        0, len(positions_m) - 1, min(len(positions_m), MAX_PATH_POINTS)
-    ).astype(np.intp)
+    gap_indices, count = _gap_indices(time_s), len(positions_m)
+    evenly_spaced = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
     drawn_indices = np.unique(np.concatenate([evenly_spaced, gap_indices]))
-    axes.plot(
-        *np.insert(
-            positions_m[drawn_indices], np.searchsorted(drawn_indices, gap_indices), np.nan, axis=0
-        ).T,
-        **style,
-    )
+    gap_rows = np.searchsorted(drawn_indices, gap_indices)
+    axes.plot(*np.insert(positions_m[drawn_indices], gap_rows, np.nan, axis=0).T, **style)
 
 
 def time_origin_s(evaluation: Evaluation) -> float:
@@ -208,11 +185,10 @@ def summary(evaluation: Evaluation) -> str:
     """Summarise ATE and largest position error in one line."""
     worst_index = int(np.argmax(evaluation.position_error_m))
     preposition = "without" if evaluation.alignment == "none" else "after"
-    error = evaluation.ate.translation_m
+    error, time_s = evaluation.ate.translation_m, evaluation.time_s - time_origin_s(evaluation)
     return (
         f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
-        f"{format_metres(error.max)} m at "
-        f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after a path of "
+        f"{format_metres(error.max)} m at {time_s[worst_index]:.1f} s, after a path of "
         f"{evaluation.distance_m[worst_index]:.1f} m."
     )
 
@@ -223,11 +199,8 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
-    page.table(
-        ERROR_TABLE_HEAD,
-        error_rows(evaluation),
-        right_aligned_columns=range(1, len(ERROR_TABLE_HEAD)),
-    )
+    head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
+    page.table(head, error_rows(evaluation), right_aligned_columns=range(1, len(head)))
     page.write_small(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
 
 
@@ -242,22 +215,19 @@ def error_rows(evaluation: Evaluation) -> list[list[str]]:
             numbers = (translation.mean, translation.median, translation.std, translation.max)
             cells = [f"{translation.rmse:.4f}", format_interval(error.interval_m)]
             cells += [*(f"{number:.4f}" for number in numbers), f"{translation.count}"]
-        rows.append(
-            [name, *cells, f"{rotation.rmse:.2f}" if isinstance(rotation, Statistics) else "–"]
-        )
+        rotation_text = f"{rotation.rmse:.2f}" if isinstance(rotation, Statistics) else "–"
+        rows.append([name, *cells, rotation_text])
     return rows
 
 
 def missing_reasons(evaluation: Evaluation) -> list[str]:
-    quantities = [
-        evaluation.ate.interval_m,
-        evaluation.ate.rotation_deg,
-        *(error.translation_m for error in evaluation.rpe),
-    ]
-    unavailable = [quantity for quantity in quantities if isinstance(quantity, Unavailable)]
-    return list(
-        dict.fromkeys(f"No {quantity.what}: {quantity.reason}." for quantity in unavailable)
-    )
+    ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
+    reasons = {
+        f"No {quantity.what}: {quantity.reason}.": None
+        for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
+        if isinstance(quantity, Unavailable)
+    }
+    return list(reasons)
 
 
 def unaligned_sentence(evaluation: Evaluation) -> str:
@@ -265,9 +235,8 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""
-    shift_m = float(
-        np.linalg.norm(alignment.apply(estimate_m.mean(axis=0)) - estimate_m.mean(axis=0))
-    )
+    middle_m = estimate_m.mean(axis=0)
+    shift_m = float(np.linalg.norm(alignment.apply(middle_m) - middle_m))
     return (
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
         f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
@@ -289,13 +258,11 @@ def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     deltas = sorted(delta for delta_unit, delta in rmse_by_unit_and_delta if delta_unit == unit)
     if len(deltas) < 2:
         return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
-    smallest_delta, largest_delta = deltas[0], deltas[-1]
-    delta_ratio, rmse_ratio = (
-        largest_delta / smallest_delta,
-        rmse_by_unit_and_delta[unit, largest_delta] / rmse_by_unit_and_delta[unit, smallest_delta],
-    )
+    smallest, *_, largest = deltas
+    delta_ratio = largest / smallest
+    rmse_ratio = rmse_by_unit_and_delta[unit, largest] / rmse_by_unit_and_delta[unit, smallest]
     return (
-        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit} the RMSE grows "
+        f"{interval_note} From {smallest:g} to {largest:g} {unit} the RMSE grows "
         f"{rmse_ratio:.2g} times. Expected: 1 for independent noise, {np.sqrt(delta_ratio):.2g} "
         f"for a random walk, {delta_ratio:.3g} for a scale or heading error."
     )
@@ -313,8 +280,7 @@ def describe_track(path: Trajectory) -> str:
 
 
 def describe_method(evaluation: Evaluation) -> str:
-    association = evaluation.association
-    offset_s = evaluation.time_offset.offset_s
+    association, offset_s = evaluation.association, evaluation.time_offset.offset_s
     offset_text = "" if not offset_s else f"; time offset {offset_s:+.3f} s"
     return (
         f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "

@@ -19,9 +19,8 @@ from px4fuse.report.style import (
 
 # Bands differ in shade and hatching, so they remain distinct in greyscale
 _BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
-GROUND_BAND, DROPOUT_BAND = (
-    {"facecolor": colour, **_BAND_STYLE} for colour in ("#e4e4e4", "#a8a8a8")
-)
+GROUND_BAND = _BAND_STYLE | {"facecolor": "#e4e4e4"}
+DROPOUT_BAND = _BAND_STYLE | {"facecolor": "#a8a8a8"}
 GAP_BAND = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
 RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
 OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
@@ -73,11 +72,10 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            visible_times_s = visible_times(
-                spans_or_times, MIN_MARK_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
-            )
+            min_interval_s = MIN_MARK_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
+            times_s = visible_times(spans_or_times, min_interval_s)
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
-            markers = Line2D(visible_times_s, np.full(len(visible_times_s), height), **mark_style)
+            markers = Line2D(times_s, np.full(len(times_s), height), **mark_style)
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
 
 
@@ -85,15 +83,14 @@ def panel(
     page: Page,
     analysis: Analysis,
     title: str,
-    caption: str,
     height: float,
     *,
-    above: float = 4.0,
     axis: str | None = None,
     with_time_label: bool = True,
+    **options: Any,
 ) -> Axes:
     """Add a plot over time with the events of :func:`draw_marks`."""
-    axes = page.panel(title, caption, height, above=above)
+    axes = page.panel(title, height, **options)
     draw_marks(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
     return axes
@@ -101,14 +98,10 @@ def panel(
 
 def outlier_times(analysis: Analysis) -> Array:
     """Return the times (s) of the outliers found by noise estimation."""
-    names = HORIZONTAL, analysis.main.axis.name
-    times_by_axis = [
-        axis_tuning.outlier_time_s
-        for name, axis_tuning in analysis.tuning.items()
-        if isinstance(axis_tuning, AxisTuning) and name in names
-    ]
-    times: Array = np.unique(np.concatenate(times_by_axis)) if times_by_axis else np.empty(0)
-    return times
+    tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
+    times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
+    outlier_times_s: Array = np.unique(np.concatenate([[], *times_s]))
+    return outlier_times_s
 
 
 def legend_entries(analysis: Analysis) -> list[Artist]:

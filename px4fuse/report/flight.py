@@ -50,7 +50,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     result = analysis.main
     start_s, end_s = zoom_span_s = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.panel(title, zoom_sentence(result), ZOOM_HEIGHT)
+    axes = page.panel(title, ZOOM_HEIGHT, caption=zoom_sentence(result))
     _draw_sawtooth(axes, result, zoom_span_s)
     update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
@@ -87,16 +87,9 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
-    prior_variance_m2, posterior_variance_m2 = (
-        updates["prior_position_variance_m2"],
-        steps["position_variance_m2"],
-    )
+    variances_m2 = pd.concat([updates["prior_position_variance_m2"], steps["position_variance_m2"]])
     # a stable sort keeps the prior variance before the posterior variance of the same update
-    variances_m2 = (
-        pd.concat([prior_variance_m2, posterior_variance_m2])
-        .sort_index(kind="stable")
-        .loc[slice(*zoom_span_s)]
-    )
+    variances_m2 = variances_m2.sort_index(kind="stable").loc[slice(*zoom_span_s)]
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
     axes.plot(variances_m2.index, np.sqrt(variances_m2), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
@@ -108,9 +101,8 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
         axes.plot(sigma_before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
         axes.plot(sigma_after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        logged_sigma = np.sqrt(
-            result.ekf2_variance["position_variance_m2"].loc[slice(*zoom_span_s)]
-        )
+        variance_m2 = result.ekf2_variance["position_variance_m2"]
+        logged_sigma = np.sqrt(variance_m2.loc[slice(*zoom_span_s)])
         axes.plot(logged_sigma, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(*zoom_span_s)
 
@@ -118,26 +110,24 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
 def zoom_sentence(result: AxisComparison) -> str:
     filter_texts = []
     for name, filter_summary in filters_by_name(result).items():
-        prior_m, posterior_m = (
-            filter_summary.sigma_p_before_update_m,
-            filter_summary.sigma_p_after_update_m,
-        )
+        prior_m = filter_summary.sigma_p_before_update_m
+        posterior_m = filter_summary.sigma_p_after_update_m
         if prior_m is None or posterior_m is None:
             if name == "EKF2":
                 filter_texts.append(
                     "σ of EKF2 before and after an update is unknown: S or R is not logged"
                 )
             continue
-        variance_reduction = 1.0 - posterior_m**2 / prior_m**2
-        change_text = (
-            f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {variance_reduction:.0%} less variance"
+        text = (
+            f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {1.0 - posterior_m**2 / prior_m**2:.0%} "
+            "less variance"
         )
         if name == "KF":
-            change_text = (
+            text = (
                 f"σ grows in each prediction (SIGMA_A {result.replay.settings.sigma_a_m_s2:g} "
-                f"m/s²) and decreases with each measurement ({change_text})"
+                f"m/s²) and decreases with each measurement ({text})"
             )
-        filter_texts.append(change_text)
+        filter_texts.append(text)
     return f"{'; '.join(filter_texts)}." if filter_texts else ""
 
 

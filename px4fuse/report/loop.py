@@ -1,6 +1,7 @@
 """Page on a loop: closure error, corrected paths, and their errors against references."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import SINGLE_LOOP_REASON
-from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, Loop
-from px4fuse.report import style
+from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
@@ -20,14 +20,16 @@ from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
     MUTED_COLOUR,
+    SEVERITY_COLOURS,
     TRACK_LINES,
     Axes,
+    line_style,
     set_map_axes,
 )
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
+from px4fuse.trajectory.graph.solver import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import Interval, Statistics
 
@@ -38,13 +40,13 @@ LEAD_TEXT = (
     "tested first, because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
-ERROR_COLOUR = style.SEVERITY_COLOURS["error"]
+ERROR_COLOUR = SEVERITY_COLOURS["error"]
 PATH_STYLES = {
     corrections.UNCORRECTED_LABEL: TRACK_LINES["EKF2"],
-    corrections.POSITIONS_CORRECTED_LABEL: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
-    corrections.HEADINGS_CORRECTED_LABEL: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
-    SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
-    SOLUTIONS["all"]: style.line_style("#8d6a9f", 0.9, (0, (2, 1))),
+    corrections.POSITIONS_CORRECTED_LABEL: line_style("#79b294", 1.3, (0, (1.2, 1.2))),
+    corrections.HEADINGS_CORRECTED_LABEL: line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
+    SOLUTIONS["gated"]: line_style(KF_COLOUR, 1.2),
+    SOLUTIONS["all"]: line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
 TRACK_KINDS = {
     "vio": "odometry (external vision)",
@@ -54,15 +56,6 @@ TRACK_KINDS = {
     "slam": "SLAM trajectory",
     "unknown": "trajectory of unknown kind",
 }
-CLOSURE_TABLE_HEAD = (
-    "closure",
-    "distance\n(m)",
-    "d²",
-    "degrees of\nfreedom",
-    "p",
-    "gate",
-    "GNC\nweight",
-)
 TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
@@ -87,7 +80,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
-    axes = page.panel("Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0)
+    axes = page.panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
     draw_map(axes, loop)
     page.legend(axes.get_legend_handles_labels()[0])
     page.heading("Loop closures and scores")
@@ -112,9 +105,8 @@ def draw_map(axes: Axes, loop: Loop) -> None:
             plot_path(axes, horizontal_m, track.time_s, label=name, **PATH_STYLES[name])
     start, end = odometry_path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
-    axes.plot(
-        *end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label="end of odometry", zorder=5
-    )
+    end_mark: dict[str, Any] = {"color": EKF2_COLOUR, "mec": "black", "mew": 0.6, "ms": 5}
+    axes.plot(*end, "s", **end_mark, label="end of odometry", zorder=5)
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         arrow = {"arrowstyle": "->", "color": ERROR_COLOUR, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
@@ -131,14 +123,8 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
         score = loop.best.scores.get(reference.name)
         if isinstance(score, Evaluation):
             reference_m = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
-            plot_path(
-                axes,
-                reference_m,
-                score.time_s,
-                label=reference.name,
-                **TRACK_LINES["ground truth"],
-                zorder=4,
-            )
+            line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
+            plot_path(axes, reference_m, score.time_s, **line)
 
 
 def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
@@ -153,53 +139,45 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     """Write the closure error, the test of the closure, and the ATE of each corrected path."""
-    path = loop.odometry.trajectory
-    track_text = (
-        f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
-        f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m"
-    )
-    page.write_labelled("Track", track_text)
-    page.write_labelled("Segment", f"{_format_span(loop)}, {loop.part_reason}")
-    page.write_labelled("Closure", describe_closure_error(loop))
+    odometry = loop.odometry.trajectory
     true_end = loop.true_end
-    page.write_labelled(
-        "True end", "not used" if isinstance(true_end, Unavailable) else true_end.source
-    )
+    texts = {
+        "Track": f"{odometry.name}: {TRACK_KINDS[odometry.kind]}, {len(odometry)} poses, "
+        f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
+        "Segment": f"{_format_span(loop)}, {loop.part_reason}",
+        "Closure": describe_closure_error(loop),
+        "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
+    }
     for closure in loop.closures[:1]:
-        page.write_labelled("Gate", describe_gate(closure))
+        texts["Gate"] = describe_gate(closure)
+    page.write_labelled_texts(texts)
     single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
-    for text in (
-        correction_by_distance_sentence(loop),
-        single_loop_note,
-        *missing_corrections(loop),
-    ):
-        page.write(text, colour=MUTED_COLOUR, above=2.0)
+    notes = correction_by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)
+    for note in notes:
+        page.write(note, colour=MUTED_COLOUR, above=2.0)
     for group in group_by_root(findings):
         write_finding(page, group)
-    reference_names = [reference.name for reference in loop.references]
-    page.table(
-        [
-            "path",
-            "correction\nRMS / max (m)",
-            *(f"ATE against\n{name} (m)" for name in reference_names),
-        ],
-        [
-            [
-                corrected_path.name,
-                format_correction(corrected_path),
-                *(_format_ate(corrected_path.scores[name]) for name in reference_names),
-            ]
-            for corrected_path in loop.reported_paths
-        ],
-    )
+    names = [reference.name for reference in loop.references]
+    head = ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)]
+    rows = []
+    for path in loop.reported_paths:
+        correction_text = "–"
+        if path.correction_max_m:
+            correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
+        ate_texts = [
+            _format_error(score.ate.translation_m, score.ate.interval_m)
+            if isinstance(score := path.scores[name], Evaluation)
+            else "–"
+            for name in names
+        ]
+        rows.append([path.name, correction_text, *ate_texts])
+    page.table(head, rows)
     page.write_small(
-        "ATE: position RMSE after alignment, with its 95 % interval (block "
-        "bootstrap) if the flight is long enough."
-        if reference_names
-        else (
-            "The error of the path is unknown without ground truth or reference "
-            "trajectory. Add a reference trajectory with --reference FILE."
-        )
+        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap) if the "
+        "flight is long enough."
+        if names
+        else "The error of the path is unknown without ground truth or reference trajectory. Add a "
+        "reference trajectory with --reference FILE."
     )
 
 
@@ -219,46 +197,28 @@ def write_scores(page: Page, loop: Loop) -> None:
         colour = "black" if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        page.table(CLOSURE_TABLE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
+        head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]
+        page.table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
-        scores = {
-            corrected_path.name: corrected_path.scores[reference.name]
-            for corrected_path in loop.reported_paths
-        }
-        evaluations = {
-            name: score for name, score in scores.items() if isinstance(score, Evaluation)
-        }
         page.heading(f"RPE against {reference.name}")
-        missing_reasons = (
-            score.reason for score in scores.values() if isinstance(score, Unavailable)
-        )
-        for reason in dict.fromkeys(missing_reasons):
+        scores = {path.name: path.scores[reference.name] for path in loop.reported_paths}
+        missing_scores = [score for score in scores.values() if isinstance(score, Unavailable)]
+        for reason in dict.fromkeys(score.reason for score in missing_scores):
             page.write(reason)
-        if not evaluations:
-            continue
-        first_evaluation = next(iter(evaluations.values()))
-        table_head = [
-            "path",
-            *(f"{error.delta_text} (m)" for error in first_evaluation.rpe),
-            "rotation (°)",
-        ]
-        page.table(
-            table_head,
+        rows = [
             [
-                [
-                    name,
-                    *(_format_error(error.translation_m, error.interval_m) for error in score.rpe),
-                    _format_rmse(score.ate.rotation_deg, 2),
-                ]
-                for name, score in evaluations.items()
-            ],
-        )
-        for text in (
-            describe_method(first_evaluation),
-            *first_evaluation.notes,
-            *first_evaluation.warnings,
-        ):
-            page.write_small(capitalise_first(text))
+                name,
+                *(_format_error(error.translation_m, error.interval_m) for error in score.rpe),
+                _format_rmse(score.ate.rotation_deg, 2),
+            ]
+            for name, score in scores.items()
+            if isinstance(score, Evaluation)
+        ]
+        for first in [score for score in scores.values() if isinstance(score, Evaluation)][:1]:
+            delta_heads = [f"{error.delta_text} (m)" for error in first.rpe]
+            page.table(["path", *delta_heads, "rotation (°)"], rows)
+            for text in (describe_method(first), *first.notes, *first.warnings):
+                page.write_small(capitalise_first(text))
 
 
 def _format_span(loop: Loop) -> str:
@@ -269,12 +229,13 @@ def _format_span(loop: Loop) -> str:
 
 def describe_closure_error(loop: Loop) -> str:
     error_m, error_axes_m = loop.closure_error_m, loop.closure_error_axes_m
+    length_m = loop.path_length_m
     if error_m is None or error_axes_m is None:
         if loop.is_assessed:
-            return f"not stated for an assignment; the path is {loop.path_length_m:.1f} m long"
-        return f"the path of {loop.path_length_m:.1f} m does not return to its start (--open)"
+            return f"not stated for an assignment; the path is {length_m:.1f} m long"
+        return f"the path of {length_m:.1f} m does not return to its start (--open)"
     text = (
-        f"{error_m:.2f} m after {loop.path_length_m:.1f} m ({error_m / loop.path_length_m:.2%}): "
+        f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_axes_m)}"
     )
     heading_deg = loop.heading_error_deg
@@ -317,19 +278,12 @@ def correction_by_distance_sentence(loop: Loop) -> str:
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    unavailable_corrections = [
-        correction
+    reasons = {
+        f"{correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable)
-    ]
-    reasons = [f"{correction.what}: {correction.reason}" for correction in unavailable_corrections]
-    return [reason for reason in dict.fromkeys(reasons) if SINGLE_LOOP_REASON not in reason]
-
-
-def _format_ate(score: Evaluation | Unavailable) -> str:
-    if isinstance(score, Unavailable):
-        return "–"
-    return _format_error(score.ate.translation_m, score.ate.interval_m)
+        if isinstance(correction, Unavailable) and SINGLE_LOOP_REASON not in correction.reason
+    }
+    return list(reasons)
 
 
 def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
@@ -341,60 +295,46 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
 
 
-def format_correction(correction: CorrectedPath) -> str:
-    if not correction.correction_max_m:
-        return "–"
-    return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
-
-
 def graph_summary(solved_graph: Graph) -> Page:
     """Make the terminal output on a pose graph: tested closures, solver and costs."""
-    page = Page()
+    page, gates = Page(), solved_graph.gates
     page.write_labelled(
         "Graph",
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    gates = solved_graph.gates
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
         page.write_labelled("Gate", "the graph has no loop closures to test")
     else:
-        rejected_gates = [gate for gate in gates if not gate.accepted]
         gate_texts = [
             f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
-            for gate in rejected_gates
+            for gate in gates
+            if not gate.accepted
         ]
+        count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
         listed_closures = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
-        page.write_labelled(
-            "Gate",
-            f"{len(rejected_gates)} of {len(gates)} loop closures rejected",
-            *listed_closures,
-        )
+        page.write_labelled("Gate", count_text, *listed_closures)
         if len(gates) > MAX_ROBUST_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
-    unconverged_solutions = [
-        SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged
-    ]
+    unconverged_solutions, rows = [], []
+    for key, solution in solved_graph.solutions.items():
+        iterations_text = f"{solution.iterations}"
+        if not solution.converged:
+            unconverged_solutions.append(SOLUTIONS[key])
+            iterations_text += " (not converged)"
+        cost_texts = [f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost)]
+        dropped_text = "" if key == "all" else f"{solution.dropped}"
+        rows.append([SOLUTIONS[key], *cost_texts, iterations_text, dropped_text])
     if unconverged_solutions:
         page.write_labelled(
             "Solver",
             f"not converged: {', '.join(unconverged_solutions)}. The cost is not at its minimum.",
         )
-    rows = [
-        [
-            SOLUTIONS[key],
-            f"{solution.cost_initial:.6g}",
-            f"{solution.cost:.6g}",
-            f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
-            "" if key == "all" else f"{solution.dropped}",
-        ]
-        for key, solution in solved_graph.solutions.items()
-    ]
     head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
     page.table(head, rows, right_aligned_columns=(1, 2, 3, 4))
     return page

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
 from px4fuse.errors import SettingsError
+from px4fuse.report.cover import FlightResults
 from px4fuse.report.page import Page, appendix_title
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
-from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
+from px4fuse.results.contract import LoopResults
 
 if TYPE_CHECKING:
     from markdown_it.token import Token
@@ -29,7 +30,7 @@ MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
-def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
+def draw(subject: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Draw the answer form and the notes of the student, if there are any."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
@@ -95,10 +96,8 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
                 for number, item in enumerate(child.children, first_number):
-                    is_numbered = child.type == "ordered_list"
-                    _write_blocks(
-                        page, item, indent_level + 1, f"{number}." if is_numbered else "•"
-                    )
+                    item_mark = f"{number}." if child.type == "ordered_list" else "•"
+                    _write_blocks(page, item, indent_level + 1, item_mark)
             case "blockquote":
                 _write_blocks(page, child, indent_level + 1)
             case "fence" | "code_block":
@@ -124,8 +123,10 @@ def _node_text(node: SyntaxTreeNode) -> str:
     match node.type:
         case "text" | "code_inline":
             return node.content
-        case "softbreak" | "hardbreak" | "html_inline":
-            return {"softbreak": " ", "hardbreak": "\n"}.get(node.type, "")
+        case "softbreak":
+            return " "
+        case "hardbreak":
+            return "\n"
         case "image":
             return f"[picture: {node.content}]" if node.content else "[picture]"
         case "link":

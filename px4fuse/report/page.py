@@ -103,20 +103,15 @@ class Page:
         right_aligned_columns : sequence of int
             Indices of the columns with numbers.
         """
-        self.add(
-            "table",
-            head=head,
-            rows=rows,
-            column_widths=column_widths,
-            right=right_aligned_columns,
-        )
+        right, widths = right_aligned_columns, column_widths
+        self.add("table", head=head, rows=rows, column_widths=widths, right=right)
 
     def panel(
         self,
         title: str,
-        caption: str,
         height: float,
         *,
+        caption: str = "",
         above: float = 4.0,
         left: float = AXIS_LEFT,
         right: float = AXES_RIGHT,
@@ -132,15 +127,13 @@ class Page:
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
         axes.locator_params(axis="x", nbins=8)
         axes.locator_params(axis="y", nbins=4)
-        margins = left, right, above
-        alternative_text = ": ".join(filter(None, (title, caption)))
         block = self.add(
             "panel",
             title=title,
             caption=caption,
-            alt=alternative_text,
+            alt=": ".join(filter(None, (title, caption))),
             axes=axes,
-            margins=margins,
+            margins=(left, right, above),
             height=height,
             width=self.width,
             figure=axes.figure,
@@ -153,14 +146,14 @@ class Page:
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
-        free_width = self.width
+        used_width = 0.0
         for entry in entries:
             width = text_width(str(entry.get_label())) + LEGEND_HANDLE_WIDTH
-            if rows[-1] and width > free_width:
+            if rows[-1] and used_width + width > self.width:
                 rows.append([])
-                free_width = self.width
+                used_width = 0.0
             rows[-1].append(entry)
-            free_width -= width
+            used_width += width
         height = LEGEND_LINE_HEIGHT * len(rows)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
         for row_index, row in enumerate(rows):
@@ -176,16 +169,8 @@ class Page:
                 columnspacing=1.2,
             )
         labels = ", ".join(str(artist.get_label()) for row in rows for artist in row)
-        alternative_text = f"Legend: {labels}"
         return self.add(
-            "panel",
-            title="",
-            caption="",
-            alt=alternative_text,
-            width=self.width,
-            height=height,
-            figure=figure,
-            compact=False,
+            "legend", alt=f"Legend: {labels}", width=self.width, height=height, figure=figure
         )
 
     def add_columns(self, *columns: Page, above: float = 6.0) -> None:

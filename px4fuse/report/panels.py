@@ -74,15 +74,14 @@ class Panel(NamedTuple):
         if not is_narrow:
             caption, height = self.caption(analysis, result), self.height
             title, numbers = ": ".join(filter(None, (title, numbers))), ""
-        # innovations that EKF2 rejected are already drawn as hollow dots
-        rejection_axis = "" if self is INNOVATIONS else result.axis.name
         axes = event_marks.panel(
             page,
             analysis,
             title,
-            caption,
             height,
-            axis=rejection_axis,
+            caption=caption,
+            # innovations that EKF2 rejected are already drawn as hollow dots
+            axis="" if self is INNOVATIONS else result.axis.name,
             with_time_label=with_time_label,
         )
         if is_narrow:
@@ -96,16 +95,23 @@ def add_legend(page: Page, analysis: Analysis) -> Block:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    result = analysis.main
     lines: list[Artist] = [
-        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="position"),
+        Line2D([], [], **style.MEASUREMENT_DOTS | {"ms": 5.0}, label="position"),
         Line2D([], [], **TRACK_LINES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
     ]
-    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
-        if isinstance(track, pd.DataFrame):
-            lines.append(Line2D([], [], **TRACK_LINES[name], label=name))
+    for name in _other_tracks(analysis.main):
+        lines.append(Line2D([], [], **TRACK_LINES[name], label=name))
     return page.legend([*lines, *event_marks.legend_entries(analysis)])
+
+
+def available_tables(**tables: object) -> dict[str, pd.DataFrame]:
+    """Return the tables that are not missing, by name."""
+    return {name: table for name, table in tables.items() if isinstance(table, pd.DataFrame)}
+
+
+def _other_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
@@ -116,10 +122,11 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     kf_values = result.replay.steps[quantity.column]
     draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance]))
     drawn_series = [kf_values]
-    for track, name in ((result.ekf2_state, "EKF2"), (result.truth, "ground truth")):
-        if isinstance(track, pd.DataFrame) and track[quantity.column].notna().any():
-            draw_curve(axes, track[quantity.column], **TRACK_LINES[name], zorder=2.5)
-            drawn_series.append(track[quantity.column])
+    for name, track in _other_tracks(result).items():
+        values = track[quantity.column]
+        if values.notna().any():
+            draw_curve(axes, values, **TRACK_LINES[name], zorder=2.5)
+            drawn_series.append(values)
     draw_curve(axes, kf_values, **TRACK_LINES["KF"])
     # the ±2σ band is very wide in the first second, so the axis is scaled to the tracks
     all_values = pd.concat(drawn_series)
@@ -133,27 +140,24 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
-    rmse_by_filter = {
-        name: getattr(filter_summary.truth, quantity.rmse, None)
-        for name, filter_summary in filters_by_name(result).items()
-    }
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
-        for name, rmse in rmse_by_filter.items()
-        if rmse is not None
+        for name, filter_summary in filters_by_name(result).items()
+        if (rmse := getattr(filter_summary.truth, quantity.rmse, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
 
 def _position_difference_text(result: AxisComparison) -> str:
-    difference = result.difference
-    text = (
-        f"{difference.what}: {difference.reason}"
-        if isinstance(difference, Unavailable)
-        else f"KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
-        f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
-    )
-    return "; ".join([*_rmse_texts(result, POSITIONS), text])
+    difference, texts = result.difference, _rmse_texts(result, POSITIONS)
+    if isinstance(difference, Unavailable):
+        texts.append(f"{difference.what}: {difference.reason}")
+    else:
+        texts.append(
+            f"KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
+            f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
+        )
+    return "; ".join(texts)
 
 
 def _velocity_difference_text(result: AxisComparison) -> str:
@@ -164,29 +168,25 @@ def _velocity_difference_text(result: AxisComparison) -> str:
 
 
 def _innovation_axis_limit_m(result: AxisComparison) -> float:
-    innovation_limits_m = []
-    for innovations in (result.replay.updates, result.ekf2_innovations):
-        if isinstance(innovations, pd.DataFrame):
-            median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
-            # a quantile, so that outliers do not enlarge the axis
-            quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-            innovation_limits_m.append(
-                max(
-                    2.0 * median_sqrt_s_m,
-                    min(quantile_m, MAX_INNOVATION_AXIS_SIGMAS * median_sqrt_s_m),
-                )
-            )
-    return INNOVATION_AXIS_MARGIN_FACTOR * max(innovation_limits_m)
+    limits_m = []
+    for innovations in _innovation_tables(result).values():
+        median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
+        # a quantile, so that outliers do not enlarge the axis
+        quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
+        largest_m = min(quantile_m, MAX_INNOVATION_AXIS_SIGMAS * median_sqrt_s_m)
+        limits_m.append(max(2.0 * median_sqrt_s_m, largest_m))
+    return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
+
+
+def _innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
     """Return ν/√S of KF and, if logged, of EKF2, by filter name."""
     return {
-        name: (
-            innovations["innovation_m"] / np.sqrt(innovations["innovation_variance_m2"])
-        ).dropna()
-        for name, innovations in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
-        if isinstance(innovations, pd.DataFrame)
+        name: (table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])).dropna()
+        for name, table in _innovation_tables(result).items()
     }
 
 
@@ -205,8 +205,7 @@ def draw_dots(
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
     axis_limit_m, ekf2_innovations = _innovation_axis_limit_m(result), result.ekf2_innovations
-    updates = result.replay.updates
-    kf_innovations = updates["innovation_m"]
+    updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
     innovations_and_styles = [(kf_innovations, INNOVATION_DOTS["KF"])]
@@ -229,14 +228,12 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
     axis_limit_m, sentences = _innovation_axis_limit_m(result), []
-    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
+    innovation_tables = _innovation_tables(result)
     for name, consistency in filters_by_name(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
-        innovations = innovation_tables[name]
-        assert isinstance(innovations, pd.DataFrame)
-        outside_count = int((innovations["innovation_m"].abs() > axis_limit_m).sum())
+        outside_count = int((innovation_tables[name]["innovation_m"].abs() > axis_limit_m).sum())
         outside_text = f"; outside the plot (triangles): {outside_count}" if outside_count else ""
         sentences.append(
             f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
@@ -246,11 +243,10 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
         )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
-    elif isinstance(result.ekf2_innovations, pd.DataFrame):
-        rejected_count = int((result.ekf2_innovations["rejected"] > 0).sum())
-        sentences += (
-            [f"EKF2 rejected {rejected_count} positions (hollow dots)."] if rejected_count else []
-        )
+    elif "EKF2" in innovation_tables:
+        rejected_count = int((innovation_tables["EKF2"]["rejected"] > 0).sum())
+        if rejected_count:
+            sentences.append(f"EKF2 rejected {rejected_count} positions (hollow dots).")
     return " ".join(sentences)
 
 
@@ -264,10 +260,13 @@ def _fraction_outside_text(result: AxisComparison) -> str:
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    for variance, name in ((result.replay.steps, "KF"), (result.ekf2_variance, "EKF2")):
-        if isinstance(variance, pd.DataFrame):
-            draw_curve(axes, np.sqrt(variance[quantity.variance]), **TRACK_LINES[name])
+    for name, variance in _variance_tables(result).items():
+        draw_curve(axes, np.sqrt(variance[quantity.variance]), **TRACK_LINES[name])
     set_log_scale(axes)
+
+
+def _variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    return available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
@@ -275,32 +274,25 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     if not analysis.events.gaps:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
-    largest_sigmas = {
-        name: float(np.sqrt(variance.loc[start_s:end_s, "position_variance_m2"].max()))
-        for name, variance in (
-            ("KF", result.replay.steps),
-            ("EKF2", result.in_flight.ekf2_variance),
-        )
-        if isinstance(variance, pd.DataFrame) and len(variance.loc[start_s:end_s]) > 1
-    }
-    sigma_texts = " and ".join(
-        f"{sigma:.2g} m ({name})" for name, sigma in largest_sigmas.items() if np.isfinite(sigma)
-    )
+    sigma_texts = []
+    for name, table in _variance_tables(result.in_flight).items():
+        variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
+        if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
+            sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")
+    if not sigma_texts:
+        return ""
     return (
-        sigma_texts
-        and f"In the gap of {end_s - start_s:.1f} s from {start_s:.0f} s, σ grew to {sigma_texts}."
+        f"In the gap of {end_s - start_s:.1f} s from {start_s:.0f} s, σ grew to "
+        f"{' and '.join(sigma_texts)}."
     )
 
 
 def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
-    medians = {
-        name: getattr(filter_summary, quantity.sigma)
-        for name, filter_summary in filters_by_name(result).items()
-    }
-    texts = [
-        f"{name} not logged" if median is None else f"{name} {median:.3f} {quantity.unit}"
-        for name, median in medians.items()
-    ]
+    texts = []
+    for name, filter_summary in filters_by_name(result).items():
+        median = getattr(filter_summary, quantity.sigma)
+        text = "not logged" if median is None else f"{median:.3f} {quantity.unit}"
+        texts.append(f"{name} {text}")
     return f"median: {', '.join(texts)}"
 
 

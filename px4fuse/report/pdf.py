@@ -43,10 +43,10 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         provenance.draw,
     ),
     contract.AidsResults: (
-        cover.draw_aids_only,
-        aids.draw_aids_only,
+        cover.draw,
+        aids.draw,
         notes.draw,
-        provenance.draw_aids,
+        provenance.draw,
     ),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.EvaluationResults: (evaluation.draw,),
@@ -57,12 +57,8 @@ def _title_name_hash(results: Any) -> tuple[str, str, str]:
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
-        case contract.EvaluationResults(estimate=estimate, reference=reference):
-            return (
-                f"px4fuse evaluate {estimate.name} {reference.name}",
-                estimate.name,
-                estimate.sha256,
-            )
+        case contract.EvaluationResults(estimate=track, reference=reference):
+            return f"px4fuse evaluate {track.name} {reference.name}", track.name, track.sha256
     log = results.log
     return f"px4fuse compare {log.name}", log.name, log.sha256
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,18 +12,18 @@ from px4fuse.comparison.model import (
     Comparison,
     Difference,
     FilterSummary,
+    PreparedComparison,
     UntestedFilter,
 )
 from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.log import ClockMap
-from px4fuse.flight.model import Alignment, Columns, Truth, Unavailable
+from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -45,10 +45,11 @@ def format_settings(settings: Settings) -> str:
     offset_text = (
         f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     )
-    return (
-        f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
-        f"DT {settings.dt_s:g} s, input {settings.input}{offset_text}"
+    numbers = (
+        f"{SETTING_RANGES[name].label} {getattr(settings, name):g} {SETTING_RANGES[name].unit}"
+        for name in KF_NUMBERS
     )
+    return f"{', '.join(numbers)}, input {settings.input}{offset_text}"
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
@@ -80,36 +81,17 @@ def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unteste
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
-def verdict_rows(
-    axes: Iterable[AxisComparison],
-    extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
-) -> list[list[Cell]]:
-    """Return a table row for each axis and filter, ending with the extra cells."""
-    rows: list[list[Cell]] = []
-    for result in axes:
-        for name, consistency in filters_by_name(result).items():
-            label = result.axis.label.removeprefix("the ") if name == "KF" else ""
-            nis_cells, colour = ("", ""), MUTED_COLOUR
-            if isinstance(consistency, Consistency):
-                nis_cells = (
-                    format_number(consistency.nis_mean),
-                    "{:.2f} – {:.2f}".format(*consistency.nis_band),
-                )
-                colour = (
-                    GOOD_COLOUR
-                    if consistency.verdict == "consistent"
-                    else SEVERITY_COLOURS["warning"]
-                )
-            rows.append(
-                [
-                    label,
-                    name,
-                    *nis_cells,
-                    (format_verdict(consistency), colour),
-                    *extra_cells(result, name, consistency),
-                ]
-            )
-    return rows
+def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
+    """Return the first cells of the table row of an axis and a filter ("KF" or "EKF2")."""
+    consistency = filters_by_name(result)[name]
+    label = result.axis.label.removeprefix("the ") if name == "KF" else ""
+    if isinstance(consistency, Unavailable):
+        return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
+    is_consistent = consistency.verdict == "consistent"
+    colour = GOOD_COLOUR if is_consistent else SEVERITY_COLOURS["warning"]
+    band_text = "{:.2f} – {:.2f}".format(*consistency.nis_band)
+    verdict = format_verdict(consistency), colour
+    return [label, name, format_number(consistency.nis_mean), band_text, verdict]
 
 
 def write_errors(page: Page, analysis: Analysis) -> None:
@@ -118,16 +100,16 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
-    def rms_cells(
-        result: AxisComparison, name: str, consistency: FilterSummary | UntestedFilter
-    ) -> list[str]:
-        difference = result.difference if name == "KF" else None
-        cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
-        return cells + [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
-
+    rows = []
+    for result in axes:
+        for name, consistency in filters_by_name(result).items():
+            difference = result.difference if name == "KF" else None
+            cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+            cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
+            rows.append([*verdict_cells(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, verdict_rows(axes, rms_cells), right_aligned_columns=(2, 3, 5, 6, 7, 8))
+    page.table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:
@@ -195,7 +177,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 
 
 def tuning_advice(
-    comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
+    comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return the recommended actions after noise estimation, with their labels as keys."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)

@@ -29,7 +29,6 @@ UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
 LABEL_COLUMNS = 9  # width (characters) of a label on the terminal
 POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
-MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
 # Terminal styles of text colours; the other colours belong to plots
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
@@ -58,10 +57,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
-                if console.width >= MIN_TABLE_WIDTH:
-                    console.print(_rich_table(**block))
-                else:
-                    _print_rows(console, **block)
+                console.print(_rich_table(**block))
             case "command":
                 print_line(console, block["label"], block["text"])
             case "blank":
@@ -94,9 +90,8 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
         if request is not None:
             text.plain, commands = expand_commands(text.plain, request)
         text.append("" if index else long_label_text)
-        print_paragraph(
-            console, text, _styled_text({**block["label"], "text": label or ""}), LABEL_COLUMNS
-        )
+        head = _styled_text({**block["label"], "text": label or ""})
+        print_paragraph(console, text, head, indent=LABEL_COLUMNS)
         for command in commands:
             print_line(console, "", command)
 
@@ -110,14 +105,13 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     """
     log = str(getattr(request, "log", "") or getattr(request, "source", ""))
     default_request = ComparisonRequest(log=log)
-    commands = {
+    commands = [
         command_line(request if name == "compare" else default_request, name, for_shell=True)
-        + options: None
+        + options
         for name, options in _COMMAND_PATTERN.findall(text)
-    }
-    return _COMMAND_PATTERN.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text), [
-        *commands
     ]
+    short_text = _COMMAND_PATTERN.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text)
+    return short_text, list(dict.fromkeys(commands))
 
 
 def _styled_text(block: Block) -> Text:
@@ -126,7 +120,7 @@ def _styled_text(block: Block) -> Text:
 
 
 def print_paragraph(
-    console: Console, text: str | Text, head: str | Text = "", indent: int = 0
+    console: Console, text: str | Text, head: str | Text = "", *, indent: int
 ) -> None:
     """Print a paragraph that wraps beside its label (``head``), indented by ``indent`` columns."""
     body = Text(text) if isinstance(text, str) else text
@@ -143,15 +137,6 @@ def print_line(console: Console, label: str, text: str, style: str = "bold cyan 
     console.print(Text(f"{label:{LABEL_COLUMNS}}", "bold").append(text, style), soft_wrap=True)
 
 
-def _print_rows(
-    console: Console, head: Sequence[str], rows: Iterable[Iterable[Cell]], **_: object
-) -> None:
-    """Print a table on a narrow terminal as one paragraph per row."""
-    for row in (head, *rows):
-        texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
-        print_paragraph(console, ", ".join(filter(None, texts)), indent=2)
-
-
 def _rich_table(
     head: Sequence[str],
     rows: Iterable[Iterable[Cell]],
@@ -159,12 +144,10 @@ def _rich_table(
     **_: object,
 ) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    vertical_alignment: Literal["bottom", "top"] = (
-        "bottom" if any("\n" in title for title in head) else "top"
-    )
+    vertical: Literal["bottom", "top"] = "bottom" if "\n" in "".join(head) else "top"
     for index, title in enumerate(head):
         side: Literal["right", "left"] = "right" if index in right else "left"
-        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical_alignment)
+        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical)
     for row in rows:
         texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
         table.add_row(*(Text(text, STYLES_BY_COLOUR.get(colour, "")) for text, colour in texts))

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
 else:  # text-only commands do not import matplotlib (0.3 s)
     Artist = Axes = Any
 __all__ = ["Artist", "Axes"]  # matplotlib types for annotations
@@ -107,11 +106,8 @@ def draw_sigma_band(
 
 
 def _max_points(axes: Axes) -> int:
-    return (
-        MAX_WIDE_POINTS
-        if axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
-        else MAX_NARROW_POINTS
-    )
+    is_wide = axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
+    return MAX_WIDE_POINTS if is_wide else MAX_NARROW_POINTS
 
 
 def set_log_scale(axes: Axes) -> None:
@@ -119,14 +115,14 @@ def set_log_scale(axes: Axes) -> None:
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.15, high * 1.25)
-    set_plain_ticks(axes.yaxis)
+    set_plain_ticks(axes)
 
 
-def set_plain_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers: 1, 2 and 5 of each decade if they fit."""
+def set_plain_ticks(axes: Axes) -> None:
+    """Label a logarithmic y axis with plain numbers: 1, 2 and 5 of each decade if they fit."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
-    low, high = axis.get_view_interval()
+    axis, (low, high) = axes.yaxis, axes.get_ylim()
     decade_ticks = (
         (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
     )
@@ -151,7 +147,7 @@ def set_map_axes(axes: Axes, right: str, up: str) -> None:
     axes.locator_params(axis="y", nbins=6)
 
 
-def decimate_series(time: Array, value: Array, limit: int = MAX_WIDE_POINTS) -> tuple[Array, Array]:
+def decimate_series(time: Array, value: Array, limit: int) -> tuple[Array, Array]:
     """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
     if len(time) <= limit:
         return time, value
@@ -161,10 +157,8 @@ def decimate_series(time: Array, value: Array, limit: int = MAX_WIDE_POINTS) -> 
         (0, split_row, bucket_size + 1),
         (split_row, len(time), bucket_size),
     ):
-        buckets, starts = (
-            value[first_row:last_row].reshape(-1, width),
-            np.arange(first_row, last_row, width),
-        )
+        buckets = value[first_row:last_row].reshape(-1, width)
+        starts = np.arange(first_row, last_row, width)
         index_groups += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
     selected_rows = np.unique(np.concatenate(index_groups))
     return time[selected_rows], value[selected_rows]

@@ -8,7 +8,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
-from px4fuse.report.aids import outdoor_aids, write_aids, write_aids_only
+from px4fuse.report.aids import outdoor_aids, write_aids
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
@@ -17,6 +17,7 @@ from px4fuse.report.phrases import (
     verdict_notes,
     write_errors,
     write_finding,
+    write_findings,
 )
 from px4fuse.report.style import MUTED_COLOUR
 
@@ -41,7 +42,9 @@ def summary(
     if not verbose:
         return page
     if isinstance(analysis, AidsOnlyAnalysis):
-        write_aids_only(page, analysis, results.findings)
+        write_aids(page, analysis.aids)
+        page.heading("Findings")
+        write_findings(page, results.findings)
     else:
         _write_details(page, analysis, results)
     return page

@@ -29,13 +29,11 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
     change_texts += [
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
-    change_text = ", ".join(change_texts)
-    ml_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-    return [
-        "logged",
-        "replayed",
-        *([f"replayed with {change_text}{ml_note}"] if change_text else []),
-    ]
+    heads = ["logged", "replayed"]
+    if change_texts:
+        ml_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
+        heads.append(f"replayed with {', '.join(change_texts)}{ml_note}")
+    return heads
 
 
 def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
@@ -93,7 +91,7 @@ def _fusion_texts(summary: Summary) -> dict[str, str]:
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     """Return the headings, and a row of statistics for each value of the swept parameter."""
-    name, statistic_rows = swept_parameter(analysis), []
+    name, rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
     for summary in sweep_summaries(analysis):
         axes = summary.axes.values()
@@ -105,7 +103,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
         ]
         if not summary.is_predictable:
             cells = [NOT_PREDICTABLE_TEXT, *[""] * 5]
-        statistic_rows.append([format_number(summary.changed[name]), *cells])
+        rows.append([format_number(summary.changed[name]), *cells])
     head = [
         f"{name} ({unit})" if unit else name,
         "mean NIS N/E",
@@ -115,7 +113,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
         "σ_p N/E (m)",
         "RMSE N/E (m)",
     ]
-    return head, statistic_rows
+    return head, rows
 
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:

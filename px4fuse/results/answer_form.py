@@ -7,8 +7,6 @@ import hashlib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.resources import files
-from itertools import pairwise
 from pathlib import Path
 from string import Template
 from typing import Annotated, Any, Literal, get_args
@@ -18,7 +16,7 @@ from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, read_toml
-from px4fuse.core.text import one_line
+from px4fuse.core.text import convert_nested, one_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -31,7 +29,7 @@ NO_MISTAKE_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
-class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
+class MistakeKind(Record, rename={"size_quantity": "in"}):
     """Injected fault that a student can name, with the quantity of its size.
 
     ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
@@ -47,7 +45,7 @@ class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
         return _UNITS[self.size_quantity]
 
 
-class FormChoices(Record, frozen=True):
+class FormChoices(Record):
     """Allowed answers of the answer form (``form.toml``), and new names of old answers."""
 
     behaviours: tuple[str, ...]
@@ -58,28 +56,26 @@ class FormChoices(Record, frozen=True):
     renamed: dict[str, str]
 
 
-_CHOICES = read_toml(__file__, "form.toml", FormChoices)
+_CHOICES = read_toml(__file__, FormChoices, "form.toml")
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
 MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
 # Units of the value of a correction (empty without a value), by name of the correction
 CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 # Verdict on a filter without innovations
 NOT_AVAILABLE = "not available"
-VERDICTS = ("consistent", "overconfident", "underconfident", NOT_AVAILABLE)
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
-RangeName = Literal["", "a", "b", "c", "d", "e"]
+VERDICTS = get_args(VerdictWord)[1:]
+ChoiceName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
 # Description of the accepted values of a text field of the answer form, by field name
 ACCEPTED_VALUES = {
-    **dict.fromkeys(
-        ("verdict_kf", "verdict_ekf2"), f"one of {', '.join(get_args(VerdictWord))[2:]}"
-    ),
+    **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or an empty text with the times from_s and until_s',
     "ekf2_did": "a list of behaviours, each in quotes",
-    "predictions": "a letter from a to e in quotes",
+    "choices": "a letter from a to e in quotes",
     "log_sha256": "the SHA-256 of the log, which px4fuse answers writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
@@ -87,36 +83,34 @@ ACCEPTED_VALUES = {
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-# Names of the ranges from which the student chooses a prediction
-PREDICTION_RANGES: tuple[RangeName, ...] = ("a", "b", "c", "d", "e")
-MAX_PREDICTIONS = 10
-PREDICTIONS_HEAD = """
-# Predictions: the same flight was simulated again with one change, and analysed with SIGMA_A 0.5
-# and SIGMA_Z 0.1. Give the letter of the range that contains the number along the main axis.
-# A wrong letter costs a quarter of the points of a right letter.
-[predictions]
+# Letters of the answers from which the student chooses
+CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
+MAX_CHOICES = 20
+CHOICES_HEAD = """
+# Figures: the picture of the same name (.png) shows flights with other faults, analysed with
+# SIGMA_A 0.5 and SIGMA_Z 0.1. The vehicle flies in the direction of the aisle in grey times. Give
+# the letter of the right answer. A wrong letter costs a quarter of the points of a right letter.
+[choices]
 """
 
 
-class Prediction(Record, frozen=True):
-    """Number of the flight simulated with one change: the student chooses one of five ranges.
+class Choice(Record):
+    """Question about a figure, with five answers: the student chooses one."""
 
-    ``quantity`` names the number and the change, ``limits`` are the four limits between the ranges.
-    """
+    question: str
+    options: tuple[str, ...]
 
-    quantity: str
-    limits: tuple[float, float, float, float]
+    def answer_text(self, letter: str) -> str:
+        """Return the text of an answer by its letter."""
+        return self.options[CHOICE_NAMES.index(letter)]
 
     @property
     def text(self) -> str:
-        first, *_, last = numbers = [f"{limit:.3g}" for limit in self.limits]
-        middle_ranges = [f"{low} to {high}" for low, high in pairwise(numbers)]
-        ranges = (f"below {first}", *middle_ranges, f"above {last}")
-        ranges_text = ", ".join(map(": ".join, zip(PREDICTION_RANGES, ranges, strict=True)))
-        return f"{self.quantity}; {ranges_text}"
+        options = map(": ".join, zip(CHOICE_NAMES, self.options, strict=True))
+        return "\n#     ".join([self.question, *options])
 
 
-class StudentMistake(Record, frozen=True):
+class StudentMistake(Record):
     """Injected fault of a flight that a student names in the answer form.
 
     ``from_s`` and ``until_s`` are times since the first data. ``parameter`` is a correction with a
@@ -151,7 +145,7 @@ class StudentMistake(Record, frozen=True):
         return self.value * units.get(self.value_unit, 1.0)
 
 
-class Answers(Record, frozen=True, kw_only=True):
+class Answers(Record, kw_only=True):
     """Student's answers about one flight; answers left blank are absent.
 
     Attributes
@@ -160,8 +154,8 @@ class Answers(Record, frozen=True, kw_only=True):
         Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
         Answers to :func:`draw_questions`; for the gate, the numbers of the updates outside it.
-    predictions : tuple of str
-        Range that the student chose for each :class:`Prediction`; "" if left blank.
+    choices : tuple of str
+        Letter that the student chose for each :class:`Choice`; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -170,7 +164,7 @@ class Answers(Record, frozen=True, kw_only=True):
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
     quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
-    predictions: Annotated[tuple[RangeName, ...], Meta(max_length=MAX_PREDICTIONS)] = ()
+    choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
     def names_no_mistake(self) -> bool:
@@ -187,7 +181,7 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 )
 
 
-class FormQuestion(Record, frozen=True):
+class FormQuestion(Record):
     """Question about KF along the main axis, which the student answers with an own filter.
 
     Attributes
@@ -232,8 +226,8 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    duration_or_gate_limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_or_gate = draw_between(*duration_or_gate_limits, 1)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
+    duration_or_gate = draw_between(*limits, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
         FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
@@ -267,11 +261,9 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     """Describe the invalid answer and the accepted values, or the line that is not TOML."""
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
-        content = one_line(text.splitlines()[int(line_match[1]) - 1], 60)
-        return (
-            f"line {line_match[1]} ({content}) is not valid; give {NUMBER_HELP}, or a word in "
-            "quotes"
-        )
+        line = line_match[1]
+        content = one_line(text.splitlines()[int(line) - 1], 60)
+        return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
     path_names = re.findall(r"\w+", path)
     if not path_names:
@@ -283,7 +275,7 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     if isinstance(invalid_value, dict):
         return f"mistake {number}: {reason}"
     accepted_text = ACCEPTED_VALUES.get(path_names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
-    if path_names[0] in ("quantities", "predictions"):
+    if path_names[0] in ("quantities", "choices"):
         field = f"{path_names[0][0]}{number}"
     place_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
     return f"{field}{place_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
@@ -292,38 +284,32 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     filled_form = _without_blanks(update_renamed_values(form))
     mistakes = filled_form.pop("mistake", ())
-    quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
-    quantity_names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
-    predictions = msgspec.convert(filled_form.pop("predictions", {}), dict[str, Any])
-    prediction_names = [f"p{number}" for number in range(1, MAX_PREDICTIONS + 1)]
+    quantities, choices = (
+        msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
+        for name in ("quantities", "choices")
+    )
+    quantity_names = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
+    choice_names = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     if unknown_fields := sorted(
         {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_names)
-        | predictions.keys() - set(prediction_names)
+        | choices.keys() - set(choice_names)
     ):
         raise ValueError(
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
             f"{', '.join(quantity_names)}"
         )
+    answered_names = choice_names if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
-        "quantities": tuple(quantities.get(name) for name in quantity_names),
-        "predictions": tuple(predictions.get(name, "") for name in prediction_names)
-        if predictions
-        else (),
+        "quantities": tuple(map(quantities.get, quantity_names)),
+        "choices": tuple(choices.get(name, "") for name in answered_names),
     }
 
 
 def update_renamed_values(value: Any) -> Any:
     """Replace names and values of answer forms and answer keys written before schema version 4."""
-    if isinstance(value, dict):
-        return {
-            update_renamed_values(key): update_renamed_values(element)
-            for key, element in value.items()
-        }
-    if isinstance(value, list):
-        return [update_renamed_values(element) for element in value]
-    return _CHOICES.renamed.get(value, value) if isinstance(value, str) else value
+    return convert_nested(value, lambda element: _CHOICES.renamed.get(element, element))
 
 
 def _without_blanks(value: Any) -> Any:
@@ -359,12 +345,12 @@ def check_answers(answers: Answers) -> None:
             if chosen_name and choices is not None:
                 _require_choice(f"{student_mistake.kind}: {field}", chosen_name, choices)
         low, high = mistake.range
-        size_in_first_unit = student_mistake.size_in_first_unit()
-        if size_in_first_unit is not None and not low <= size_in_first_unit <= high:
-            unit, limits_text = next(iter(mistake.units)), f"{low:g} to {high:g}"
+        size = student_mistake.size_in_first_unit()
+        if size is not None and not low <= size <= high:
+            unit = next(iter(mistake.units))
             raise ValueError(
-                f"{student_mistake.kind}: size {size_in_first_unit:g} is out of range "
-                f"({limits_text} {unit})"
+                f"{student_mistake.kind}: size {size:g} is out of range ({low:g} to {high:g} "
+                f"{unit})"
             )
 
 
@@ -383,11 +369,9 @@ def form_name(log_name: str) -> str:
     return f"{Path(log_name).stem}.answers.toml"
 
 
-def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] = ()) -> str:
+def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
     """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
-    template = Template(
-        files("px4fuse.results").joinpath("answer_form.toml").read_text(encoding="utf-8")
-    )
+    template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
         for number, question in enumerate(draw_questions(log_sha256), start=1)
@@ -396,7 +380,7 @@ def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] 
         f"{name:13} {mistake.description}{_format_units(mistake.units)}"
         for name, mistake in MISTAKES.items()
     )
-    return template.substitute(
+    return Template(template).substitute(
         log=log_name,
         form=form_name(log_name),
         sha256=log_sha256,
@@ -407,8 +391,8 @@ def form_text(log_name: str, log_sha256: str, predictions: Sequence[Prediction] 
         panels=_format_block(_format_in_threes(PANELS)),
         questions="\n".join(questions),
     ) + "".join(
-        f'{PREDICTIONS_HEAD * (number == 1)}# {prediction.text}\np{number} = ""\n'
-        for number, prediction in enumerate(predictions, start=1)
+        f'{CHOICES_HEAD * (number == 1)}# {choice.text}\nc{number} = ""\n'
+        for number, choice in enumerate(choices, start=1)
     )
 
 
@@ -421,11 +405,11 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
         value_units = CORRECTIONS.get(mistake.parameter, {})
         value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
-        from_text = "" if mistake.from_s is None else f"from {mistake.from_s:g} s"
-        until_text = "" if mistake.until_s is None else f"until {mistake.until_s:g} s"
+        times = (("from", mistake.from_s), ("until", mistake.until_s))
+        time_texts = [f"{word} {time_s:g} s" for word, time_s in times if time_s is not None]
         details = (
             _format_number_with_unit(mistake.size, mistake.unit, size_units),
-            mistake.when or f"{from_text} {until_text}".strip(),
+            mistake.when or " ".join(time_texts),
             f"shown in {mistake.panel}" if mistake.panel else "",
             f"{mistake.parameter} {value_text}".strip(),
         )
@@ -436,9 +420,9 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    for number, range_name in enumerate(answers.predictions, start=1):
-        if range_name:
-            yield f"Prediction p{number}", range_name
+    letters = [f"c{number} {letter}" for number, letter in enumerate(answers.choices, 1) if letter]
+    if letters:
+        yield "Answers about the figures", ", ".join(letters)
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

@@ -64,11 +64,9 @@ def within_bounds(results: T) -> T:
             Unavailable(reason.partition(" ")[0], reason, CHECK_LOG_REMEDY) for reason in reasons
         )
         return replace(checked_results, missing=(*checked_results.missing, *removed_numbers))
-    return (
-        replace(checked_results, notes=(*checked_results.notes, *reasons))
-        if hasattr(checked_results, "notes")
-        else checked_results
-    )
+    if hasattr(checked_results, "notes"):
+        return replace(checked_results, notes=(*checked_results.notes, *reasons))
+    return checked_results
 
 
 def types_of(annotation: Any) -> tuple[Any, ...]:
@@ -98,18 +96,14 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
-        value_before, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
+        element, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            value_after = _check_value(value_before, field.type, field_path, reasons)
+            changes[field.name] = _check_or_replace(element, field.type, field_path, reasons)
         except _OutOfBoundsError as error:
-            if field.default is None:
-                reasons.append(str(error))
-                value_after = None
-            else:
-                value_after = _make_unavailable(
-                    value_before, field.type, field_path, error, reasons
-                )
-        changes[field.name] = value_after
+            if field.default is not None:
+                raise
+            reasons.append(str(error))
+            changes[field.name] = None
     return replace(value, **changes)
 
 
@@ -119,16 +113,10 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
     )
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
-        element_path = f"{path}.{key}"
         try:
-            checked_elements[key] = _check_value(element, value_type, element_path, reasons)
+            checked_elements[key] = _check_or_replace(element, value_type, f"{path}.{key}", reasons)
         except _OutOfBoundsError as error:
-            try:
-                checked_elements[key] = _make_unavailable(
-                    element, value_type, element_path, error, reasons
-                )
-            except _OutOfBoundsError:
-                reasons.append(str(error))
+            reasons.append(str(error))
     if not checked_elements and any(
         getattr(meta, "min_length", 0) for meta in get_args(annotation)[1:]
     ):
@@ -149,16 +137,18 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
     return tuple(checked_elements)
 
 
-def _make_unavailable(
-    record: Any, annotation: Any, path: str, error: _OutOfBoundsError, reasons: list[str]
-) -> Unavailable:
-    for unavailable_type in types_of(annotation):
-        if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-            texts = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
-            other_fields = {
-                field.name: _check_value(getattr(record, field.name), field.type, path, reasons)
-                for field in fields(unavailable_type)
-                if field.name not in texts and hasattr(record, field.name)
-            }
-            return unavailable_type(**texts, **other_fields)
-    raise error
+def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
+    """Check a value; an Unavailable replaces it if a number is outside its bounds."""
+    try:
+        return _check_value(value, annotation, path, reasons)
+    except _OutOfBoundsError as error:
+        for unavailable_type in types_of(annotation):
+            if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
+                texts = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
+                other_fields = {
+                    field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
+                    for field in fields(unavailable_type)
+                    if field.name not in texts and hasattr(value, field.name)
+                }
+                return unavailable_type(**texts, **other_fields)
+        raise

@@ -8,7 +8,7 @@ import msgspec
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.record import to_serializable
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
@@ -28,7 +28,7 @@ from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import Graph
+from px4fuse.trajectory.graph.solver import Graph
 
 
 def results(
@@ -79,7 +79,7 @@ def outcome_results(
 
 def tuning_results(
     request: ComparisonRequest,
-    comparison: Comparison,
+    comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
     common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
@@ -89,7 +89,7 @@ def tuning_results(
 
 
 def sync_results(
-    request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
+    request: ComparisonRequest, comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
     common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
     return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
@@ -112,9 +112,7 @@ def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract
     )
 
 
-def loop_results(
-    request: LoopRequest, loop: Loop, student: Student = NO_STUDENT
-) -> contract.LoopResults:
+def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP_SCHEMA),
@@ -171,7 +169,10 @@ def _common_fields(
 
 
 def _flight_fields(
-    name: str, request: ComparisonRequest, comparison: Comparison, command: str | None = None
+    name: str,
+    request: ComparisonRequest,
+    comparison: PreparedComparison,
+    command: str | None = None,
 ) -> dict[str, Any]:
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters

@@ -17,6 +17,7 @@ from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
+from px4fuse.core.text import convert_nested
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
@@ -26,14 +27,12 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.flight.log import ClockMap, InputFile, LogInfo
-from px4fuse.flight.model import Alignment
-from px4fuse.flight.position_source import DataPath, PositionKind
+from px4fuse.flight.model import Alignment, ClockMap, DataPath, InputFile, LogInfo, PositionKind
 from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import Graph
+from px4fuse.trajectory.graph.solver import Graph
 from px4fuse.trajectory.model import Track
 
 COMPARISON_SCHEMA = "px4fuse-results"
@@ -45,14 +44,14 @@ CHANGES_SCHEMA = "px4fuse-changes"
 SIGNIFICANT_DIGITS = 10
 
 
-class Log(LogInfo, frozen=True, kw_only=True):
+class Log(LogInfo, kw_only=True):
     """Log of a flight, with its other input files and the clocks mapped to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
 
 
-class AvailableTrack(Record, frozen=True):
+class AvailableTrack(Record):
     name: str
     kind: PositionKind
     path: DataPath
@@ -60,7 +59,7 @@ class AvailableTrack(Record, frozen=True):
     rate_hz: Positive | None = None
 
 
-class PositionSource(Record, frozen=True, kw_only=True):
+class PositionSource(Record, kw_only=True):
     """Position source with which KF and EKF2 are compared.
 
     ``kind`` is the type of sensor, and ``path`` states how the positions reached the log.
@@ -85,7 +84,7 @@ class PositionSource(Record, frozen=True, kw_only=True):
     alignment: Alignment | None = None
 
 
-class ChosenSettings(Record, frozen=True, kw_only=True):
+class ChosenSettings(Record, kw_only=True):
     """Settings of KF and time span; ``clock_offset_s`` was added to the source's timestamps."""
 
     sigma_a_m_s2: Positive
@@ -107,7 +106,7 @@ DiffSide = Literal["A", "B"]
 Interval = tuple[float, float | None]
 
 
-class DiffInput(Record, frozen=True, kw_only=True):
+class DiffInput(Record, kw_only=True):
     """Input A or B of ``px4fuse diff``: file name (``given``), and the log of its results."""
 
     given: str
@@ -117,7 +116,7 @@ class DiffInput(Record, frozen=True, kw_only=True):
     px4fuse: Version
 
 
-class NumberChange(Record, frozen=True, kw_only=True):
+class NumberChange(Record, kw_only=True):
     """Number that differs between the inputs A and B, with 95 % intervals if there are any.
 
     ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
@@ -133,7 +132,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
     b_interval: Interval | None = None
 
 
-class SettingChange(Record, frozen=True):
+class SettingChange(Record):
     """Setting, PX4 parameter or property of a flight that differs between the inputs A and B."""
 
     name: str
@@ -141,7 +140,7 @@ class SettingChange(Record, frozen=True):
     b: float | str | None = None
 
 
-class FindingChange(Record, frozen=True):
+class FindingChange(Record):
     """Finding that the results of only one of the inputs A and B contain."""
 
     id: str
@@ -150,7 +149,7 @@ class FindingChange(Record, frozen=True):
     only_in: DiffSide
 
 
-class _FlightResults(Record, frozen=True):
+class _FlightResults(Record):
     """Base class of the results for one flight with positions for KF."""
 
     schema: Schema
@@ -160,7 +159,7 @@ class _FlightResults(Record, frozen=True):
     settings: ChosenSettings
 
 
-class ComparisonResults(_FlightResults, frozen=True):
+class ComparisonResults(_FlightResults):
     """Results of ``px4fuse compare``, attached to its report.
 
     Attributes
@@ -201,7 +200,7 @@ class ComparisonResults(_FlightResults, frozen=True):
     convention: Convention | None = None
 
 
-class AidsResults(Record, frozen=True):
+class AidsResults(Record):
     """Results of ``px4fuse compare`` without positions for KF: EKF2's aiding sources only."""
 
     schema: Schema
@@ -215,21 +214,21 @@ class AidsResults(Record, frozen=True):
     provenance: Provenance
 
 
-class TuningResults(_FlightResults, frozen=True):
+class TuningResults(_FlightResults):
     """Results of ``px4fuse tune``: maximum-likelihood estimates of the noises, by axis."""
 
     tuning: dict[str, OrUnavailable[AxisTuning]]
     provenance: Provenance
 
 
-class SyncResults(_FlightResults, frozen=True):
+class SyncResults(_FlightResults):
     """Results of ``px4fuse sync``: time offset of the position source."""
 
     clock: OrUnavailable[ClockOffset]
     provenance: Provenance
 
 
-class LoopResults(Record, frozen=True):
+class LoopResults(Record):
     """Results of ``px4fuse loop`` on a flight or a trajectory."""
 
     schema: Schema
@@ -242,7 +241,7 @@ class LoopResults(Record, frozen=True):
     provenance: Provenance
 
 
-class GraphResults(Record, frozen=True):
+class GraphResults(Record):
     """Results of ``px4fuse loop`` on a pose graph file."""
 
     schema: Schema
@@ -250,7 +249,7 @@ class GraphResults(Record, frozen=True):
     provenance: Provenance
 
 
-class EvaluationResults(Evaluation, frozen=True, kw_only=True):
+class EvaluationResults(Evaluation, kw_only=True):
     """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
 
     schema: Schema
@@ -259,7 +258,7 @@ class EvaluationResults(Evaluation, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class WhatIfResults(Record, frozen=True, kw_only=True):
+class WhatIfResults(Record, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
     All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the user gave no
@@ -281,7 +280,7 @@ class WhatIfResults(Record, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class ChangeResults(Record, frozen=True, kw_only=True):
+class ChangeResults(Record, kw_only=True):
     """Results of ``px4fuse diff``: differences from A to B.
 
     ``worse`` has one sentence for each verdict that is worse in B; the exit code is then 1.
@@ -383,14 +382,6 @@ def round_number(value: float) -> float:
     return round(value, 6) if abs(value) >= 1e4 else float(f"{value:.{SIGNIFICANT_DIGITS}g}")
 
 
-def _round_numbers(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _round_numbers(element) for key, element in value.items()}
-    if isinstance(value, list | tuple):
-        return list(map(_round_numbers, value))
-    return round_number(value) if isinstance(value, float) else value
-
-
 def _to_builtin(value: Any) -> float | dict[str, Any]:
     if isinstance(value, Mapping):
         return dict(value)
@@ -408,7 +399,9 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
         The results contain a number that is not finite.
     """
     plain_results = to_json_dict(results) if isinstance(results, msgspec.Struct) else results
-    rounded_results = _round_numbers(plain_results)
+    rounded_results = convert_nested(
+        plain_results, lambda value: round_number(value) if isinstance(value, float) else value
+    )
     return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

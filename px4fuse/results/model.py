@@ -20,7 +20,7 @@ MAX_STUDENT_NAME_LENGTH = 10_000
 Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
 
-class Schema(Record, frozen=True):
+class Schema(Record):
     """Name and version of the schema of results."""
 
     name: str
@@ -39,7 +39,7 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 NO_STUDENT = Student()
 
 
-class Provenance(Record, frozen=True):
+class Provenance(Record):
     """Versions and command line with which results were made.
 
     Attributes

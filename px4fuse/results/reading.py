@@ -8,7 +8,7 @@ import msgspec
 from msgspec.structs import fields
 
 from px4fuse.core.record import decode_record_or_unavailable
-from px4fuse.core.text import clean_text, one_line
+from px4fuse.core.text import clean_text, convert_nested, one_line
 from px4fuse.errors import ResultsError
 from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
@@ -16,6 +16,22 @@ from px4fuse.results.model import SCHEMA_VERSION
 
 # Maximum size of results (bytes), and of an integer in them (bits)
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
+
+
+class _Schema(msgspec.Struct, frozen=True):
+    name: str
+    version: str
+
+
+class _Writer(msgspec.Struct, frozen=True):
+    px4fuse: str = "of that schema version"
+
+
+class _Head(msgspec.Struct, frozen=True):
+    """Fields that results of all versions of the schema contain."""
+
+    schema: _Schema
+    provenance: _Writer = _Writer()
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
@@ -34,25 +50,20 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if len(data) > MAX_RESULTS_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
     try:
-        decoded = _clean_values(msgspec.json.decode(data))
+        decoded = convert_nested(msgspec.json.decode(data), _clean_value)
         json.loads(data, object_pairs_hook=_require_unique_keys)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
-    schema = decoded.get("schema") if isinstance(decoded, dict) else None
-    results_type = (
-        RESULTS_BY_SCHEMA.get(str(schema.get("name"))) if isinstance(schema, dict) else None
-    )
-    if schema is None or results_type is None:
-        raise ResultsError(f"{name} contains no results of px4fuse.")
-    version, (major, minor) = str(schema.get("version")), SCHEMA_VERSION.split(".")
+    try:
+        head = msgspec.convert(decoded, _Head)
+        results_type = RESULTS_BY_SCHEMA[head.schema.name]
+    except (msgspec.ValidationError, KeyError) as error:
+        raise ResultsError(f"{name} contains no results of px4fuse.") from error
+    version, (major, minor) = head.schema.version, SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        provenance = decoded.get("provenance")
-        writer_version = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader_version = (
-            one_line(str(writer_version), 60) if writer_version else "of that schema version"
-        )
+        reader_version = one_line(head.provenance.px4fuse, 60)
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with px4fuse {reader_version}.",
@@ -94,12 +105,10 @@ def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
         raise ValueError("a JSON key is repeated")
 
 
-def _clean_values(value: Any) -> Any:
-    """Clean all texts in decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
+def _clean_value(value: Any) -> Any:
+    """Clean a text of decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
     if isinstance(value, str):
         return clean_text(value)
-    if isinstance(value, dict):
-        return {clean_text(key): _clean_values(child) for key, child in value.items()}
     if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
         raise ValueError("an integer has more than 64 bits")
-    return list(map(_clean_values, value)) if isinstance(value, list) else value
+    return value

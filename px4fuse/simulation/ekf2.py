@@ -15,15 +15,14 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import (
-    EAST,
     HEADING,
-    NORTH,
+    HORIZONTAL_POSITION,
     POSITION_COLUMNS,
     FilterConfiguration,
     SegmentRun,
 )
 from px4fuse.ekf2.heights import barometer_samples_inside
-from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
+from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, Inputs, ReceivedPositions
 from px4fuse.ekf2.model import delayed_states, run_configurations
 from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
 from px4fuse.ekf2.replay_segments import (
@@ -66,26 +65,6 @@ from px4fuse.trajectory.rotation import (
 PREDICTION_STEP_US = 10_000
 # σ (gauss) per axis of earth field and magnetometer bias at the start of the log
 FIELD_SIGMA_GAUSS = 0.03
-# Rules of EKF2 v1.14 and later for external vision (ev_control.cpp, common.h)
-VISION_RULES = FusionRules(
-    start_interval_s=0.2,
-    stop_s=0.4,
-    reset_s=1.0,
-    max_resets=5,
-    min_bias_variance=None,
-    uses_delay_as_horizon=False,
-)
-# Rules of EKF2 v1.16 for GNSS (gps_control.cpp, common.h)
-GNSS_RULES = FusionRules(
-    start_interval_s=np.inf,
-    stop_s=np.inf,
-    reset_s=7.0,
-    max_resets=UNLIMITED_RESETS,
-    min_bias_variance=None,
-    uses_delay_as_horizon=False,
-    reset_variance_factor=2.0,
-    resets_velocity=True,
-)
 # Time (s) without any aiding source after which EKF2 holds its position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
@@ -153,14 +132,32 @@ def simulate_ekf2(
     aid, aids = scenario.aid, _fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
     logged_values = {name: float(np.float32(v)) for name, v in log_parameters.items()}
+    step_s = float(np.median(segment.step_s))
     if other_sensors:
         magnetometer, barometer = other_sensors
-        segment = replace(segment, heights=_barometer_heights(segment, barometer))
+        magnetometer_s, barometer_s = (
+            sensors.seconds(sensors.time_us(topic)) - 0.5 * step_s for topic in other_sensors
+        )
+        # the barometer is EKF2's only height source outdoors
+        down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
+        no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
+        samples = barometer_samples_inside(
+            segment, barometer_s, down_m, no_dead_zone, sample_weight
+        )
+        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
+        segment = replace(segment, heights=heights)
         if not logged_values[MAG.switch]:
-            segment = _with_field_states(segment, magnetometer)
+            segment = add_field_states(
+                segment,
+                magnetometer_s,
+                magnetometer.fields["magnetometer_ga"].astype(np.float64),
+                1.0,
+                # EKF2 initialises earth field and magnetometer bias on the ground
+                np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
+                np.full(6, FIELD_SIGMA_GAUSS**2),
+            )
     settings = effective_settings(logged_values, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
-    step_s = float(np.median(segment.step_s))
     buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = Inputs(
         settings=settings,
@@ -189,7 +186,7 @@ def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
     """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
-    time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
+    time_us = sensors.time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
     rotation_steps_rad, velocity_steps_m_s = (
@@ -211,9 +208,16 @@ def _make_segment(
     attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
         :, HEADING
     ]
-    mean_imu_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_BEFORE_LOG_S)
+    force_m_s2, rate_rad_s = sensors.measure_imu(
+        scenario,
+        mistakes,
+        motion,
+        np.zeros(1),
+        sensors.Stream.REST,
+        REST_BEFORE_LOG_S * scenario.imu_rate_hz,
+    )
     state, covariance = _initial_state_at_rest(
-        body_to_ned[0], *mean_imu_at_rest, float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
@@ -242,26 +246,6 @@ def _make_segment(
         step_us,
         true_quaternions,
     )
-
-
-def _with_field_states(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
-    """Add earth field and magnetometer bias to the states of the EKF2 model."""
-    measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
-    field_gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
-    # EKF2 initialises earth field and magnetometer bias on the ground
-    state_gauss = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
-    return add_field_states(
-        segment, measured_at_s, field_gauss, 1.0, state_gauss, np.full(6, FIELD_SIGMA_GAUSS**2)
-    )
-
-
-def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
-    """Make the height samples of the barometer, the only height source of EKF2 outdoors."""
-    measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
-    down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-    samples = barometer_samples_inside(segment, measured_at_s, down_m, no_dead_zone, sample_weight)
-    return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
 
 
 def _initial_state_at_rest(
@@ -295,7 +279,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     """
     fields = source.topic.fields
     timestamp_s, arrival_s = (
-        sensors.seconds(fields[name].astype(np.int64) - sensors.START_US)
+        sensors.seconds(sensors.time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
@@ -365,23 +349,18 @@ def _hold_without_aiding(
     Return the position resets (step, size in m), and a mask of the steps with an aiding source.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
-    horizontal = slice(NORTH, EAST + 1)
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
     last_aid_s = np.zeros(len(time_s))
     last_aid_s[events.end_step[aid_events]] = time_s[events.end_step[aid_events]]
     is_step_aided = time_s - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
-    aiding_ends = np.flatnonzero(np.diff(is_step_aided.astype(int)) == -1) + 1
-    aiding_starts = np.flatnonzero(np.diff(is_step_aided.astype(int)) == 1) + 1
-    for hold_start, hold_end in zip(
-        aiding_ends, [*aiding_starts, len(time_s)][: len(aiding_ends)], strict=True
-    ):
-        state[hold_start:hold_end, horizontal] = state[hold_start - 1, horizontal]
-        state[hold_start:hold_end, VELOCITY.start : VELOCITY.start + 2] = 0.0
+    last_aided_steps = np.maximum.accumulate(np.arange(len(time_s)) * is_step_aided)
+    state[:, HORIZONTAL_POSITION] = state[last_aided_steps, HORIZONTAL_POSITION]
+    state[~is_step_aided, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(model_run.reset[:, 0]):
         step = int(events.end_step[event])
         reset_m = model_run.innovation[event, 0, POSITION_COLUMNS]
         if not is_step_aided[step - 1]:
-            reset_m = state[step, horizontal] - state[step - 1, horizontal]
+            reset_m = state[step, HORIZONTAL_POSITION] - state[step - 1, HORIZONTAL_POSITION]
         resets.append((step, reset_m))
     return resets, is_step_aided

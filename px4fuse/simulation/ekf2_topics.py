@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, SegmentRun
+from px4fuse.ekf2.filter_recursion import HORIZONTAL_POSITION, POSITION_COLUMNS, SegmentRun
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
@@ -91,8 +91,8 @@ def ekf2_topics(
     estimator_aid_src_ev_pos is logged (0: all messages).
     """
     topics = (
-        _local_position_topic(track, is_gnss=inputs.aid == GNSS_POS),
-        _states_topic(model_run, track, is_gnss=inputs.aid == GNSS_POS),
+        _local_position_topic(inputs, track),
+        _states_topic(inputs, model_run, track),
         *_position_aid_topics(inputs, model_run, track, aid_source_hz),
         *_barometer_topics(inputs, model_run, track),
         *_magnetometer_topics(inputs, model_run, track, attitude_hz),
@@ -101,7 +101,7 @@ def ekf2_topics(
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
+def _local_position_topic(inputs: Inputs, track: TopicTrack) -> Topic:
     rows = np.flatnonzero(sensors.keep_at_rate(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     resets_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in track.resets)])
@@ -111,12 +111,12 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
     is_step_aided = track.is_step_aided[np.maximum(rows - track.lag_steps, 0)]
     fields |= {"delta_xy": resets_m[reset_count], "xy_reset_counter": reset_count % 256}
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
-    if is_gnss:
+    if inputs.aid == GNSS_POS:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
     return topic("vehicle_local_position", fields)
 
 
-def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
+def _states_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:
     """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
     end_step = model_run.events[0].end_step
     events = track.logged_events(np.diff(end_step, prepend=0) > 0, end_step, STATES_HZ)
@@ -125,7 +125,7 @@ def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) ->
     states[:, 0:4] = track.delayed_attitude[rows]
     states[:, 4 : 4 + track.delayed_states.shape[1]] = track.delayed_states[rows]
     states[:, 7:9] = 0.0  # v1.16 logs latitude and longitude instead of horizontal positions
-    if is_gnss:
+    if inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= sensors.HOME_POSITION[2]
     covariances = np.zeros((len(rows), 24), np.float32)
@@ -139,6 +139,7 @@ def _position_aid_topics(
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
     events, run, received = model_run.events[0], model_run, inputs.received
+    velocity_m_s = received.velocity_m_s
     event_rows = track.logged_events(events.usable, events.end_step, rate_hz)
     steps, sample_indices = events.end_step[event_rows], events.sample[event_rows]
     timestamps = track.timestamps(steps, events.time_s[event_rows])
@@ -148,23 +149,23 @@ def _position_aid_topics(
     innovation, innovation_variance, noise_variance = (
         values[event_rows, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
-    is_not_tested = np.isnan(innovation[:, :1])
     # EKF2 also logs an innovation for positions that it does not test, but the model computes none
-    innovation = np.where(
-        is_not_tested, measured_m - track.delayed_states[steps][:, POSITION][:, :2], innovation
-    )
-    innovation_variance = np.where(
-        is_not_tested,
-        run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise_variance,
-        innovation_variance,
+    innovation, innovation_variance = np.where(
+        np.isnan(innovation[:, :1]),
+        (
+            measured_m - track.delayed_states[steps][:, POSITION][:, :2],
+            run.variance[event_rows + 1, 0, HORIZONTAL_POSITION] + noise_variance,
+        ),
+        (innovation, innovation_variance),
     )
     fused_us = np.where(
         run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[steps], -1
     )
     newest_fused_us = np.maximum.accumulate(fused_us)
     last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
-    is_gnss = received.velocity_m_s is not None
-    observed = unproject(north, east, sensors.HOME_POSITION[:2]) if is_gnss else (north, east)
+    observed = north, east
+    if velocity_m_s is not None:
+        observed = unproject(north, east, sensors.HOME_POSITION[:2])
     position_topic = _aid_source_topic(
         inputs.aid,
         inputs.settings,
@@ -173,7 +174,7 @@ def _position_aid_topics(
         (innovation, innovation_variance, noise_variance),
         (run.rejected[event_rows, 0], run.fused[event_rows, 0]),
     )
-    if received.velocity_m_s is None:
+    if velocity_m_s is None:
         return (position_topic,)
     velocity_innovation, velocity_innovation_variance, velocity_noise = (
         values[event_rows, 0, :3] for values in innovation_arrays
@@ -186,7 +187,7 @@ def _position_aid_topics(
         GNSS_VEL,
         inputs.settings,
         timestamps,
-        received.velocity_m_s[sample_indices],
+        velocity_m_s[sample_indices],
         (velocity_innovation, velocity_innovation_variance, velocity_noise),
         (is_outside_gate, ~is_outside_gate & np.isfinite(velocity_innovation).all(axis=1)),
     )
@@ -238,11 +239,12 @@ def _magnetometer_topics(
     observed_gauss = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
-    published_rows = np.flatnonzero(
-        sensors.keep_at_rate(sensors.seconds(track.time_us), attitude_hz)
-    )
-    status_rows = np.flatnonzero(
-        sensors.keep_at_rate(sensors.seconds(track.time_us[: -track.lag_steps]), FLAGS_HZ)
+    published_rows, status_rows = (
+        np.flatnonzero(sensors.keep_at_rate(sensors.seconds(time_us), rate_hz))
+        for time_us, rate_hz in (
+            (track.time_us, attitude_hz),
+            (track.time_us[: -track.lag_steps], FLAGS_HZ),
+        )
     )
     return [
         sensors.attitude_topic(
@@ -291,8 +293,7 @@ def _aid_source_topic(
         "innovation_rejected": decisions[0],
         "fused": decisions[1],
     }
-    name = f"estimator_aid_src_{aid.name}"
-    return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
+    return topic(f"estimator_aid_src_{aid.name}", fields)
 
 
 def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:

@@ -146,7 +146,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
     motion, source = simulation.motion, simulation.positions
     accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, mistakes)
     first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
-    timestamps_us = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
+    timestamps_us = sensors.time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
     answer_data: dict[str, Any] = to_json_types(
         {

@@ -104,7 +104,7 @@ MISTAKES: Mapping[str, Mistake] = {
             field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
         ),
     )
-    for name, mistake in read_toml(__file__, "mistakes.toml", dict[str, Mistake]).items()
+    for name, mistake in read_toml(__file__, dict[str, Mistake]).items()
 }
 
 
@@ -140,10 +140,8 @@ def parse_mistakes(texts: Iterable[str]) -> Mistakes:
             )
         value_by_field[mistake.fields[0]] = mistake.default
         for field, value in zip(mistake.size_fields, typed_values, strict=False):
-            bounds, typed_size = (
-                BOUNDS_BY_FIELD[field],
-                convert_to_unit(value, BOUNDS_BY_FIELD[field].unit),
-            )
+            bounds = BOUNDS_BY_FIELD[field]
+            typed_size = convert_to_unit(value, bounds.unit)
             if typed_size is None:
                 raise SettingsError(
                     f"--mistake {option_text}: {value!r} is not a valid value: give "

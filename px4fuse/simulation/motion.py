@@ -174,13 +174,14 @@ def attitude(state: State) -> Attitude:
     z = thrust_opposite_m_s2 / thrust_m_s2
     z_rate = -state.jerk_m_s3 / thrust_m_s2
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
-    c, s = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
-    zx, zy, zz = z.T
-    # n = z × [cos ψ, sin ψ, 0] is parallel to the body's y axis (ψ: yaw)
-    n = np.stack([-zz * s, zz * c, zx * s - zy * c], axis=1)
-    ux, uy, uz = z_rate.T
-    n_rate = np.stack([-uz * s, uz * c, ux * s - uy * c], axis=1)
-    n_rate += state.yaw_rate_rad_s[:, None] * np.stack([-zz * c, -zz * s, zx * c + zy * s], axis=1)
+    yaw_rad = state.yaw_rad
+    nose, right = (
+        np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+        for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
+    )
+    # n = z × nose is parallel to the body's y axis
+    n = np.cross(z, nose)
+    n_rate = np.cross(z_rate, nose) + state.yaw_rate_rad_s[:, None] * np.cross(z, right)
     n_length = np.sqrt(np.einsum("ij,ij->i", n, n))
     y = n / n_length[:, None]
     x = np.cross(y, z)

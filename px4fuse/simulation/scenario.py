@@ -149,7 +149,7 @@ class Scenario:
     truth_rate_hz: float = 50.0
     truth: bool = True
     ekf2: bool = True
-    seed: int = bounded_number(1, 0, 2**32 - 1, "", "--seed")
+    seed: int = bounded_number(1, 0, 2**128 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -174,21 +174,11 @@ class Scenario:
 
     @property
     def source_rate_hz(self) -> float:
-        rate_by_kind_hz = {
-            "aisle": self.uwb_rate_hz,
-            "loop": self.vio_rate_hz,
-            "outdoor": self.gnss_rate_hz,
-        }
-        return rate_by_kind_hz[self.kind]
+        return (self.uwb_rate_hz, self.vio_rate_hz, self.gnss_rate_hz)[KINDS.index(self.kind)]
 
     @property
     def source_sigma_m(self) -> float:
-        sigma_by_kind_m = {
-            "aisle": self.sigma_uwb_m,
-            "loop": self.sigma_vio_m,
-            "outdoor": self.sigma_gnss_m,
-        }
-        return sigma_by_kind_m[self.kind]
+        return (self.sigma_uwb_m, self.sigma_vio_m, self.sigma_gnss_m)[KINDS.index(self.kind)]
 
     @property
     def aid(self) -> Aid:

@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
@@ -68,23 +68,8 @@ LAND_DETECTOR_INTERVAL_US = 1_000_000
 # injected fault of one sensor does not change the noise of other sensors
 Stream = IntEnum(
     "Stream",
-    [
-        "WANDER",
-        "BIAS",
-        "IMU",
-        "ATTITUDE",
-        "TIMING",
-        "SOURCE",
-        "DRIFT",
-        "NLOS",
-        "VIBRATION",
-        "HEIGHT",
-        "REST",
-        "SLOW",
-        "FIX_VELOCITY",
-        "FIELD",
-        "BAROMETER",
-    ],
+    "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
+    "FIELD BAROMETER",
     start=0,
 )
 
@@ -132,19 +117,12 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
-    truth = attitude(motion.at(seconds(time_us)))
-    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
-    rng = random_stream(scenario, Stream.IMU)
-    shape = (len(time_us), 3)
-    force_m_s2 = truth.specific_force_m_s2 + accelerometer_bias_m_s2
-    force_m_s2 += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
-    rate_rad_s = truth.angular_rate_rad_s + gyro_bias_rad_s
-    rate_rad_s += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
+    force_m_s2, rate_rad_s = measure_imu(scenario, mistakes, motion, seconds(time_us), Stream.IMU)
     if mistakes.vibration_m_s2:
         vibration_sigma_m_s2 = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force_m_s2 += vibration_sigma_m_s2 * random_stream(
             scenario, Stream.VIBRATION
-        ).standard_normal(shape)
+        ).standard_normal(force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
@@ -189,12 +167,13 @@ def height_error(scenario: Scenario, time_s: Array) -> Array:
 
 def limit_rate(unlimited_topic: Topic, rate_hz: float) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    return _select_messages(unlimited_topic, keep_at_rate(time_s(unlimited_topic), rate_hz))
+    times_s = seconds(time_us(unlimited_topic))
+    return _select_messages(unlimited_topic, keep_at_rate(times_s, rate_hz))
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
-    times_s = time_s(full_topic)
+    times_s = seconds(time_us(full_topic))
     is_outside_gap = _is_outside_gap(
         times_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
     )
@@ -203,27 +182,35 @@ def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     )
 
 
-def time_s(topic: Topic) -> Array:
-    """Return the publication time of each message, seconds from the first data."""
-    return seconds(topic.fields["timestamp"].astype(np.int64) - START_US)
+def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
+    """Return the publication time (or another time) of each message, µs from the first data."""
+    return np.asarray(topic.fields[field].astype(np.int64) - START_US)
 
 
 def _select_messages(topic: Topic, is_kept: BoolArray) -> Topic:
     return Topic(topic.name, {name: values[is_kept] for name, values in topic.fields.items()})
 
 
-def mean_imu_at_rest(
-    scenario: Scenario, mistakes: Mistakes, motion: Motion, time_s: float
-) -> tuple[Array, Array]:
-    """Simulate the mean specific force (m/s²) and angular rate (rad/s) at rest before the log."""
-    truth = attitude(motion.at(np.zeros(1)))
-    accelerometer_bias_m_s2, gyro_bias_rad_s = biases(scenario, mistakes)
-    rng = random_stream(scenario, Stream.REST)
-    noise_factor = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
-    force_m_s2 = truth.specific_force_m_s2[0] + accelerometer_bias_m_s2
-    force_m_s2 += noise_factor * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
-    rate_rad_s = truth.angular_rate_rad_s[0] + gyro_bias_rad_s
-    rate_rad_s += noise_factor * scenario.gyro_noise_rad_s * rng.standard_normal(3)
+def measure_imu(
+    scenario: Scenario,
+    mistakes: Mistakes,
+    motion: Motion,
+    time_s: Array,
+    stream: Stream,
+    mean_count: float = 1.0,
+) -> ArrayPair:
+    """Simulate specific force (m/s²) and angular rate (rad/s), mean of ``mean_count`` samples."""
+    truth = attitude(motion.at(time_s))
+    rng, measured = random_stream(scenario, stream), []
+    for true_value, bias, sigma in zip(
+        (truth.specific_force_m_s2, truth.angular_rate_rad_s),
+        biases(scenario, mistakes),
+        (scenario.accelerometer_noise_m_s2, scenario.gyro_noise_rad_s),
+        strict=True,
+    ):
+        noise = 1.0 / np.sqrt(mean_count) * sigma * rng.standard_normal(true_value.shape)
+        measured.append(true_value + bias + noise)
+    force_m_s2, rate_rad_s = measured
     return force_m_s2, rate_rad_s
 
 

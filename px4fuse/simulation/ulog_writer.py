@@ -18,8 +18,8 @@ _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# Type, default value (if any) and length of each field, by topic and field name
-TOPIC_FIELDS = read_toml(__file__, "topics.toml", dict[str, dict[str, str]])
+# Types, defaults and names of the fields of each topic
+TOPIC_FIELDS = read_toml(__file__, dict[str, str], "topics.toml")
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,18 @@ class Topic:
     instance: int = 0
 
 
-def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
+def topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
     """Make a topic with PX4's fields and types, and defaults for missing fields.
 
-    A scalar value is used for all messages. ``table_row`` is the name in ``topics.toml``, if it
-    differs from the name of the topic.
+    A scalar value is used for all messages.
     """
-    known_fields = {"timestamp": "uint64", "timestamp_sample": "uint64"}
-    known_fields |= TOPIC_FIELDS[table_row or name]
+    fields_text = TOPIC_FIELDS.get(name, TOPIC_FIELDS["estimator_aid_src"])
+    known_fields = {
+        field: type_and_default
+        for line in ["uint64: timestamp timestamp_sample", *fields_text.splitlines()]
+        for type_and_default, names in [line.split(":")]
+        for field in names.split()
+    }
     unknown_fields = field_values.keys() - known_fields.keys()
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     message_count, fields = np.size(field_values["timestamp"]), {}
@@ -88,12 +92,11 @@ def encode(
         content.append(
             _keyed_message("P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value))
         )
+    data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
         content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
         )
-    data_messages: list[bytes] = []
-    for topic_id, topic in enumerate(topics):
         data_messages += _data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
     content += [

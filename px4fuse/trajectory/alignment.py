@@ -29,7 +29,7 @@ MAX_YAW_RESIDUAL_RATIO = 1.0
 MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
-class Transform(Record, frozen=True):
+class Transform(Record):
     """Similarity transform x ↦ scale · R x + t, from the estimate's frame to the reference's.
 
     Attributes
@@ -91,23 +91,16 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
-    if kind == "yaw":
-        estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
-        yaw_rad = float(
-            np.angle(
-                np.vdot(
-                    estimate_xy_m - estimate_xy_m.mean(), reference_xy_m - reference_xy_m.mean()
-                )
-            )
-        )
-        transform = _align_means(Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4)
-        _require_determined(transform, estimate_m, reference_m, kind)
-        return transform
     # The motion is tested with a fitted scale, because a scale factor error does not make the
     # rotation uncertain
-    similarity = umeyama(estimate_m, reference_m, with_scale=True)
-    _require_determined(similarity, estimate_m, reference_m, kind)
-    return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
+    transform = umeyama(estimate_m, reference_m, with_scale=True)
+    if kind == "yaw":
+        estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
+        centred_estimate_m = estimate_xy_m - estimate_xy_m.mean()
+        yaw_rad = np.angle(np.vdot(centred_estimate_m, reference_xy_m - reference_xy_m.mean()))
+        transform = _align_means(Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4)
+    _require_determined(transform, estimate_m, reference_m, kind)
+    return umeyama(estimate_m, reference_m, with_scale=False) if kind == "se3" else transform
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
@@ -126,12 +119,9 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # Umeyama eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Umeyama eq. 43
     estimate_variance_m2 = float((x * x).sum() / len(x))  # Umeyama eq. 36
-    # Umeyama eq. 42; a tiny variance would give an infinite scale
-    scale = (
-        float(d @ s / estimate_variance_m2)
-        if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2
-        else 1.0
-    )
+    scale = 1.0
+    if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # else the scale would be infinite
+        scale = float(d @ s / estimate_variance_m2)  # Umeyama eq. 42
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
     return _align_means(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
 
@@ -141,8 +131,8 @@ def _align_means(
 ) -> Transform:
     """Return the transform with this rotation and scale that aligns the means (eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
-    w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
-    return Transform((w, x, y, z), tuple(translation_m.tolist()), scale, degrees_of_freedom)
+    quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
+    return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)
 
 
 def _principal_extents(position_m: Array) -> Array:
@@ -160,13 +150,13 @@ def _require_determined(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""
-    estimate_extents = _principal_extents(estimate_m)
-    reference_extents = _principal_extents(reference_m)
+    estimate_extents, reference_extents = map(_principal_extents, (estimate_m, reference_m))
+    residuals_m = reference_m - transform.apply(estimate_m)
     if kind == "yaw":
         extent_m = min(
             float(np.hypot(*_principal_extents(m[:, :2]))) for m in (estimate_m, reference_m)
         )
-        residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
+        residuals_m = residuals_m[:, :2]
         max_extent_m = float(np.linalg.norm(reference_extents))
         max_residual_ratio = MAX_YAW_RESIDUAL_RATIO
         motion_text = "horizontal motion"
@@ -176,10 +166,10 @@ def _require_determined(
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * estimate_extents, reference_extents
         )
-        residual_m = rms_m(reference_m - transform.apply(estimate_m))
         max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
         motion_text = "motion perpendicular to the main direction"
         possible_alignment = "yaw or none"
+    residual_m = rms_m(residuals_m)
     if (
         extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * max_extent_m)
         or residual_m > max_residual_ratio * extent_m

@@ -23,7 +23,7 @@ MIN_GAP_LIMIT_S = 0.1
 MAX_NEAREST_DIFFERENCE_S = 0.01
 
 
-class Association(Record, frozen=True):
+class Association(Record):
     """Association of the poses of two trajectories by time, with the numbers of unused poses.
 
     Attributes
@@ -98,16 +98,11 @@ def associate(
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    outside_count = int(
-        ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
-    )
+    is_outside = (time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)
+    outside_count = int(is_outside.sum())
     used_steps_s = np.diff(time_s[pose_indices])
-    max_used_step_s = max(5.0 * estimate_interval_s, 0.5)
-    covered_fraction = float(
-        used_steps_s[used_steps_s <= max_used_step_s].sum() / (last_s - first_s)
-    )
-    used_count = len(np.unique(pose_indices))
-    pose_count = len(estimate)
+    used_steps_s = used_steps_s[used_steps_s <= max(5.0 * estimate_interval_s, 0.5)]
+    used_count, pose_count = len(np.unique(pose_indices)), len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
@@ -115,7 +110,7 @@ def associate(
         outside=outside_count,
         in_gaps=pose_count - outside_count - used_count,
         coverage_estimate=used_count / pose_count,
-        coverage_reference=min(covered_fraction, 1.0),
+        coverage_reference=min(float(used_steps_s.sum() / (last_s - first_s)), 1.0),
     )
     return estimate[pose_indices], matched_reference, association
 
@@ -142,11 +137,8 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    return replace(
-        trajectory.with_positions(positions_at(trajectory, time_s)),
-        rotation=rotation,
-        time_s=time_s,
-    )
+    poses = trajectory.with_positions(positions_at(trajectory, time_s))
+    return replace(poses, rotation=rotation, time_s=time_s)
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
@@ -173,9 +165,6 @@ def _pair_nearest(
         right_rows,
         left_rows,
     )
-    pair_rows = np.flatnonzero(np.abs(longer_s[nearest_rows] - shorter_s) <= limit_s)
-    return (
-        (nearest_rows[pair_rows], pair_rows)
-        if is_estimate_longer
-        else (pair_rows, nearest_rows[pair_rows])
-    )
+    rows = np.flatnonzero(np.abs(longer_s[nearest_rows] - shorter_s) <= limit_s)
+    nearest_rows = nearest_rows[rows]
+    return (nearest_rows, rows) if is_estimate_longer else (rows, nearest_rows)

@@ -8,29 +8,129 @@ accumulate in it.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from msgspec import structs
 
-from px4fuse.core.arrays import Array, median_interval
+from px4fuse.core.arrays import Array, BoolArray, median_interval
 from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
-from px4fuse.trajectory.artefacts import (
-    LEVER_ARM_ITERATIONS,
-    drop_constant_orientation,
-    find_frozen_poses,
-    find_jumps,
-    has_other_body_axes,
-)
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
+
+# Maximum rotation (rad) in a constant orientation, from rounded digits in a file
+MAX_CONSTANT_ROTATION_RAD = 1e-6
+# Minimum number of poses, and minimum motion (m), for a constant orientation
+MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
+# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference during a frozen
+# pose
+MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
+# Minimum length (m) of a jump of the estimate relative to the reference, and minimum ratio of the
+# jump to the median difference of the step lengths
+MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
+# Maximum distance (m) from the first position, or from 0, after a restart of the map
+MAX_RESTART_DISTANCE_M = 0.5
+# Maximum number of jumps whose times are stated
+MAX_STATED_JUMPS = 5
+# Minimum constant rotation (rad) between orientations of different body axes
+MIN_BODY_ROTATION_RAD = np.radians(30.0)
+# Maximum RMS deviation (rad) from the constant rotation between body axes
+MAX_BODY_DEVIATION_RAD = np.radians(5.0)
+# Number of alternating estimates of alignment and lever arm
+LEVER_ARM_ITERATIONS = 5
+
+
+def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
+    """Remove the orientation of a trajectory that moves without rotating; return also a note."""
+    rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
+    if (
+        rotation is None
+        or len(trajectory) < MIN_CONSTANT_POSES
+        or extent_m < MIN_CONSTANT_MOTION_M
+        or (rotation[0].inv() * rotation).magnitude().max() > MAX_CONSTANT_ROTATION_RAD
+    ):
+        return trajectory, ()
+    return replace(trajectory, rotation=None), (
+        f"{trajectory.name} has no orientation (constant quaternion). Rotations are not scored.",
+    )
+
+
+def find_frozen_poses(
+    estimate: Trajectory, reference: Trajectory, time_offset_s: float
+) -> tuple[BoolArray, tuple[str, ...]]:
+    """Return a mask of positions that repeat while the reference moves, and warnings."""
+    is_frozen, warnings = np.zeros(len(estimate), bool), []
+    is_new = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
+    for start, end in pairwise([*np.flatnonzero(is_new).tolist(), len(estimate)]):
+        start_s, end_s = estimate.time_s[[start, end - 1]].tolist()
+        if end_s - start_s < MIN_FROZEN_S:
+            continue
+        motion = reference.between(start_s + time_offset_s, end_s + time_offset_s).position_m
+        if (
+            len(motion)
+            and (motion_m := np.linalg.norm(np.ptp(motion, axis=0))) > MIN_FROZEN_MOTION_M
+        ):
+            is_frozen[start + 1 : end] = True
+            warnings.append(
+                f"The position of {estimate.name} does not change from "
+                f"{start_s - estimate.time_s[0]:.1f} s to {end_s - estimate.time_s[0]:.1f} s after "
+                f"its start ({(end - start) / len(estimate):.0%} of the estimate), while the "
+                f"reference moves {motion_m:.1f} m. These poses are not scored."
+            )
+    return is_frozen, tuple(warnings)
+
+
+def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
+    """Return a warning if matched poses of the estimate jump and those of the reference do not."""
+    step_lengths_m = [
+        np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
+        for trajectory in (estimate, reference)
+    ]
+    differences_m = np.abs(step_lengths_m[0] - step_lengths_m[1])
+    if not len(differences_m):
+        return ()
+    is_jump = (differences_m > max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))) & (
+        step_lengths_m[0] > step_lengths_m[1]
+    )
+    rows = np.flatnonzero(is_jump)
+    if not len(rows):
+        return ()
+    times_s = estimate.time_s[rows + 1] - estimate.time_s[0]
+    times_text = ", ".join(f"{time_s:.1f}" for time_s in times_s[:MAX_STATED_JUMPS])
+    starts_m = estimate.position_m[0], np.zeros(3)
+    distances_m = [
+        np.linalg.norm(estimate.position_m[rows + 1] - start_m, axis=1) for start_m in starts_m
+    ]
+    cause = "a lost track or a relocalisation"
+    if np.min(distances_m) < MAX_RESTART_DISTANCE_M:
+        cause = "a restart of the map, because it returns to its origin"
+    return (
+        f"{estimate.name} jumps by up to {differences_m[rows].max():.1f} m, {times_text} s after "
+        f"its start: probably {cause}. ATE and RPE contain the jumps. One alignment does not fit "
+        "both parts: evaluate the poses before and after a jump as separate files.",
+    )
+
+
+def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
+    """Return True if the orientations are of different body axes, such as those of a camera."""
+    if aligned_estimate.rotation is None or reference.rotation is None:
+        return False
+    difference = aligned_estimate.rotation.inv() * reference.rotation
+    mean_difference = difference.mean()
+    deviation_rad = (mean_difference.inv() * difference).magnitude()
+    return bool(
+        mean_difference.magnitude() > MIN_BODY_ROTATION_RAD
+        and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
+    )
+
 
 # Maximum scale factor error (ratio minus 1) of the estimate without a warning
 MAX_SCALE_ERROR = 0.1
@@ -53,7 +153,7 @@ _KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
 _MONOCULAR_NAME = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
-class AbsoluteError(Record, frozen=True):
+class AbsoluteError(Record):
     """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
 
     translation_m: Statistics
@@ -61,7 +161,7 @@ class AbsoluteError(Record, frozen=True):
     rotation_deg: OrUnavailable[Statistics]
 
 
-class Evaluation(Record, frozen=True, kw_only=True):
+class Evaluation(Record, kw_only=True):
     """ATE and RPE of an estimate against a reference, with alignment, time offset and tracks.
 
     Attributes
@@ -181,12 +281,6 @@ def evaluate(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
-    rotation_statistics: OrUnavailable[Statistics]
-    if isinstance(rotations, Unavailable):
-        rotation_statistics = rotations
-    else:
-        rotation_deg = np.degrees((rotations[0].inv() * rotations[1]).magnitude())
-        rotation_statistics = scores.statistics(rotation_deg)
     if rpe_deltas is None:
         rpe_deltas = scores.default_deltas(distance_m, matched_estimate.time_s)
     return Evaluation(
@@ -200,7 +294,9 @@ def evaluate(
         ate=AbsoluteError(
             scores.statistics(position_error_m),
             scores.rmse_interval(position_error_m, "ATE"),
-            rotation_statistics,
+            rotations
+            if isinstance(rotations, Unavailable)
+            else scores.rotation_statistics(*rotations),
         ),
         rpe=tuple(
             scores.relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
@@ -245,15 +341,12 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         {estimate.frame, reference.frame} <= set(vertical_frames)
         for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
     )
-    tracks_without_vertical = [
-        track for track in (estimate, reference) if track.kind in _KINDS_WITHOUT_VERTICAL
-    ]
     if is_upright and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
         return "yaw", (
-            f"Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
+            "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
             f"({frames}), so a tilt is an error."
         )
-    scale = 1.0
+    scale, scale_reason = 1.0, ""
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
@@ -262,72 +355,65 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
                 f"and z is vertical in both frames ({frames})."
             )
-    frame_reason = f"the frames {frames} have no common vertical direction"
-    if tracks_without_vertical:
-        track = tracks_without_vertical[0]
-        is_slam = track.kind == "slam"
-        cause = (
-            "SLAM uses the frame of the first key frame"
-            if is_slam
-            else "the trajectory kind is unknown"
-        )
-        frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
-    monocular_names = [
-        track.name for track in (estimate, reference) if _MONOCULAR_NAME.search(track.name)
-    ]
-    scale_reasons = [f"{name} is monocular according to the file name" for name in monocular_names]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
-        scale_reasons.append(
+        scale_reason = (
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
         )
-    if not tracks_without_vertical or not scale_reasons:
-        return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
-    return "sim3", (
-        f"Rotation, position and scale are aligned (7 degrees of freedom): {frame_reason}, and "
-        f"{scale_reasons[0]}."
-    )
+    for track in (reference, estimate):
+        if _MONOCULAR_NAME.search(track.name):
+            scale_reason = f"{track.name} is monocular according to the file name"
+    for track in (estimate, reference):
+        if track.kind in _KINDS_WITHOUT_VERTICAL:
+            cause = "the trajectory kind is unknown"
+            if track.kind == "slam":
+                cause = "SLAM uses the frame of the first key frame"
+            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
+            if scale_reason:
+                return "sim3", (
+                    "Rotation, position and scale are aligned (7 degrees of freedom): "
+                    f"{frame_reason}, and {scale_reason}."
+                )
+            break
+    else:
+        frame_reason = f"the frames {frames} have no common vertical direction"
+    return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
 
 
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
     """Choose the offset to add to the timestamps of the estimate; also return warnings."""
-    if isinstance(given_s, float | int):
-        return TimeOffset(
-            offset_s=given_s, is_determinable=True, reason="The user chose the time offset."
-        ), []
+    is_given = isinstance(given_s, float | int)
     clock_offset_s = clock_difference(estimate, reference)
+    if isinstance(given_s, float | int):
+        clock_offset_s = given_s
     clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
-    clock_offset = TimeOffset(
-        offset_s=clock_offset_s or 0.0,
+    added_s = clock_offset_s or 0.0
+    offset = TimeOffset(
+        offset_s=added_s,
         is_determinable=True,
-        reason=f"px4fuse uses {clock_text}.",
+        reason="The user chose the time offset." if is_given else f"px4fuse uses {clock_text}.",
     )
-    start_s, end_s = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
+    start_s, end_s = estimate.time_s[[0, -1]] + added_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
     # The boot clock of a flight log and the clock of a trajectory file are unrelated
     are_clocks_unrelated = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
     is_estimated = given_s == "auto" or is_disjoint
-    if not (is_estimated or are_clocks_unrelated):
-        return clock_offset, []
-    estimated_offset = estimate_time_offset(estimate, reference)
+    if is_given or not (is_estimated or are_clocks_unrelated):
+        return offset, []
+    estimated = estimate_time_offset(estimate, reference)
     if is_estimated:
-        if estimated_offset.is_determinable:
-            return estimated_offset, []
-        fallback = structs.replace(
-            clock_offset, is_determinable=False, reason=estimated_offset.reason
-        )
-        return fallback, [f"{estimated_offset.reason} Instead, px4fuse uses {clock_text}."]
-    offset_s, (low_s, high_s) = (
-        estimated_offset.offset_s or 0.0,
-        estimated_offset.interval_s or (0.0, 0.0),
-    )
-    is_doubtful = not low_s <= 0.0 <= high_s and abs(offset_s) >= MIN_DOUBTFUL_OFFSET_S
-    warning = (
-        f"The timestamps are unchanged, but the motions match best with {offset_s:+.3f} s added "
-        "to the timestamps of the estimate. For unrelated clocks, give --time-offset auto."
-    )
-    return clock_offset, [warning] if is_doubtful else []
+        if estimated.is_determinable:
+            return estimated, []
+        fallback = structs.replace(offset, is_determinable=False, reason=estimated.reason)
+        return fallback, [f"{estimated.reason} Instead, px4fuse uses {clock_text}."]
+    low_s, high_s = estimated.interval_s or (0.0, 0.0)
+    if low_s <= 0.0 <= high_s or abs(estimated.offset_s or 0.0) < MIN_DOUBTFUL_OFFSET_S:
+        return offset, []
+    return offset, [
+        f"The timestamps are unchanged, but the motions match best with {estimated.offset_s:+.3f} "
+        "s added to the timestamps of the estimate. For unrelated clocks, give --time-offset auto."
+    ]
 
 
 def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
@@ -406,26 +492,23 @@ def _move_to_reference_body(
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
-    lever_arm_m, corrected_estimate = np.zeros(3), estimate
+    reference_axes = reference.rotation.as_matrix()
+    centred_axes = (reference_axes - reference_axes.mean(axis=0)).reshape(-1, 3)
+    corrected = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
-        transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
+        transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
         body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
-        centred_axes = reference.rotation.as_matrix()
-        centred_axes = centred_axes - centred_axes.mean(axis=0)
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
-        lever_arm_m = np.linalg.lstsq(centred_axes.reshape(-1, 3), centred_error_m, rcond=None)[0]
-        shift_m = (estimate.rotation * body_rotation).apply(lever_arm_m) / transform.scale
-        corrected_estimate = replace(
-            estimate,
-            position_m=estimate.position_m - shift_m,
-            rotation=estimate.rotation * body_rotation,
-        )
+        lever_arm_m = np.linalg.lstsq(centred_axes, centred_error_m, rcond=None)[0]
+        rotation = estimate.rotation * body_rotation
+        position_m = estimate.position_m - rotation.apply(lever_arm_m) / transform.scale
+        corrected = replace(estimate, position_m=position_m, rotation=rotation)
     lever_arm_text = ", ".join(
         f"{value:+.2f} m along {axis}" for value, axis in zip(lever_arm_m, "xyz", strict=True)
     )
-    return corrected_estimate, (
+    return corrected, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
         "estimate has other body axes than the reference, for example those of a camera. Its "
         f"origin is at {lever_arm_text} of the reference body. Both are corrected before the "
@@ -447,11 +530,12 @@ def _with_reference_body_axes(
         and track.frame not in vehicle_frames
         for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
     )
-    if aligned_estimate.rotation is None or reference.rotation is None or not axes_differ:
+    estimate_rotation = aligned_estimate.rotation
+    if estimate_rotation is None or reference.rotation is None or not axes_differ:
         return aligned_estimate, ()
     # chordal mean (Hartley 2013, section 5.3)
-    rotation = (aligned_estimate.rotation.inv() * reference.rotation).mean()
-    return replace(aligned_estimate, rotation=aligned_estimate.rotation * rotation), (
+    rotation = (estimate_rotation.inv() * reference.rotation).mean()
+    return replace(aligned_estimate, rotation=estimate_rotation * rotation), (
         "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
         f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
         "lever arm between vehicle and camera.",

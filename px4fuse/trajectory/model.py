@@ -11,8 +11,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.core.notebook_display import one_line_repr
-from px4fuse.core.record import Count, Record
+from px4fuse.core.record import Count, Record, one_line_repr
 
 # Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
 TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
@@ -62,7 +61,7 @@ def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
-class Track(Record, frozen=True):
+class Track(Record):
     """Description of a trajectory and its file, for results.json."""
 
     name: str

@@ -3,6 +3,7 @@
 Errors of successive poses are correlated, so intervals use a block bootstrap.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,7 +58,7 @@ class Delta:
         return f"{self.value:g} {self.unit}"
 
 
-class Statistics(Record, frozen=True):
+class Statistics(Record):
     """Statistics of ``count`` errors, in the unit of the errors.
 
     The standard deviation ``std`` divides by ``count``.
@@ -72,7 +73,7 @@ class Statistics(Record, frozen=True):
     max: float
 
 
-class Interval(Record, frozen=True):
+class Interval(Record):
     """95 % interval of an RMSE by block bootstrap.
 
     Attributes
@@ -90,7 +91,7 @@ class Interval(Record, frozen=True):
     blocks: float
 
 
-class RelativeError(Record, frozen=True):
+class RelativeError(Record):
     """RPE of pairs of poses with a distance of ``delta``.
 
     Attributes
@@ -134,26 +135,25 @@ def statistics(errors: Array) -> Statistics:
     )
 
 
+def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
+    """Compute the statistics of the angles (°) between two series of rotations."""
+    return statistics(np.degrees((a.inv() * b).magnitude()))
+
+
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
-    path_length_m = float(distance_m[-1])
-    duration_s = float(time_s[-1] - time_s[0])
-    # The minimum distance or time of a pair is two median intervals between poses
-    median_step_m = median_interval(distance_m)
-    median_interval_s = median_interval(time_s)
-    min_distance_m = max(MIN_DELTA_FRACTION * path_length_m, 2.0 * median_step_m)
-    max_distance_m = MAX_DELTA_FRACTION * path_length_m
-    distances_m = [
-        value for value in DEFAULT_DISTANCES_M if min_distance_m <= value <= max_distance_m
-    ][-MAX_DISTANCE_DELTAS:]
-    times_s = [
-        t
-        for t in DEFAULT_TIMES_S
-        if 2.0 * median_interval_s <= t <= MAX_DELTA_FRACTION * duration_s
-    ][-MAX_TIME_DELTAS:]
+
+    def choose(progress: Array, values: Sequence[float], min_fraction: float) -> list[float]:
+        total = float(np.ptp(progress))
+        # The minimum distance or time of a pair is two median intervals between poses
+        minimum = max(min_fraction * total, 2.0 * median_interval(progress))
+        return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
+
+    distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
+    times_s = choose(time_s, DEFAULT_TIMES_S, 0.0)
     return (
-        *(Delta(value, "m") for value in distances_m),
-        *(Delta(value, "s") for value in times_s),
+        *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
+        *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
     )
 
 
@@ -265,7 +265,7 @@ def relative_error(
             inverse * rotation[end_indices]
             for inverse, rotation in zip(inverses, rotations, strict=True)
         )
-        rotation_deg = statistics(np.degrees((reference_turn.inv() * estimated_turn).magnitude()))
+        rotation_deg = rotation_statistics(reference_turn, estimated_turn)
     # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
     translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
     overlap_count = int(np.median(end_indices - start_indices)) if all_pairs else 1

@@ -28,8 +28,6 @@ MAX_GRID_SAMPLES = 200_000
 # Standard deviation (s) of the Gaussian filter of positions, because differentiated positions are
 # noisy
 SMOOTHING_S = 0.25
-# Minimum overlap (s) of the two trajectories in time
-MIN_OVERLAP_S = 5.0
 # Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
 # Minimum ratio of the number of overlapping poses to the number of poses in the time span of the
@@ -67,7 +65,7 @@ MAX_HALF_INTERVAL_S = 0.5
 CONFIDENCE_LEVEL = 0.95
 
 
-class TimeOffset(Record, frozen=True, kw_only=True):
+class TimeOffset(Record, kw_only=True):
     """Time offset between two trajectories.
 
     Attributes
@@ -119,19 +117,19 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
     """Estimate the offset to add to the timestamps of the sparse trajectory."""
     clock_offset_s = clock_difference(sparse_track, dense_track)
-    candidates = ([] if clock_offset_s is None else [clock_offset_s]) + _find_candidates(
-        sparse_track, dense_track
-    )
+    candidates = _find_candidates(sparse_track, dense_track)
+    if clock_offset_s is not None:
+        candidates.insert(0, clock_offset_s)
     if not candidates:
         return _not_determinable(
             "the speeds of both trajectories are not correlated at any time offset (no motion, "
             "constant speed, or different flights)"
         )
-    coarse_fits = [
-        _refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates
-    ]
-    accepted_fits = [fit for fit in coarse_fits if fit is not None and fit.misfit <= MAX_MISFIT]
-    accepted_fits.sort(key=lambda fit: fit.misfit)
+    fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
+    accepted_fits = sorted(
+        (fit for fit in fits if fit is not None and fit.misfit <= MAX_MISFIT),
+        key=lambda fit: fit.misfit,
+    )
     if not accepted_fits:
         return _not_determinable(
             "the time offsets with correlated speeds do not fit the positions, or both "
@@ -141,18 +139,16 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     similar_fits = [
         fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
     ]
-    distant_fits = [
-        fit for fit in similar_fits if abs(fit.offset_s - best_fit.offset_s) > MIN_PEAK_DISTANCE_S
-    ]
     if clock_offset_s is not None:
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
         best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
-    elif distant_fits:
-        return _not_determinable(
-            "the motion is periodic: with a time offset that differs by "
-            f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
-            f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
-        )
+    for fit in similar_fits if clock_offset_s is None else []:
+        difference_s = abs(fit.offset_s - best_fit.offset_s)
+        if difference_s > MIN_PEAK_DISTANCE_S:
+            return _not_determinable(
+                f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
+                f"the ATE is {fit.rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
+            )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_WINDOW_S)
@@ -183,20 +179,20 @@ def _not_determinable(reason: str) -> TimeOffset:
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
     """Compute smoothed velocities (m/s) on a regular time grid."""
     time_s = trajectory.time_s
-    grid_s = time_s[0] + step_s * np.arange(int((time_s[-1] - time_s[0]) / step_s) + 1)
-    sigma_samples = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
-    velocity_step_m: Array = gaussian_filter1d(
-        positions_at(trajectory, grid_s), sigma_samples, axis=0, order=1
-    )
-    return grid_s, velocity_step_m / step_s
+    grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
+    return grid_s, _smooth(positions_at(trajectory, grid_s), time_s, step_s, order=1) / step_s
+
+
+def _smooth(grid_values: Array, time_s: Array, step_s: float, order: int = 0) -> Array:
+    """Smooth values on a time grid, or return their derivative (order 1) by grid steps."""
+    sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
+    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=order))
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
-    duration_s = float(trajectory.time_s[-1] - trajectory.time_s[0])
-    grid_s, velocity_m_s = _grid_velocity(
-        trajectory, max(GRID_STEP_S, duration_s / MAX_GRID_SAMPLES)
-    )
+    step_s = max(GRID_STEP_S, float(np.ptp(trajectory.time_s)) / MAX_GRID_SAMPLES)
+    grid_s, velocity_m_s = _grid_velocity(trajectory, step_s)
     return np.stack([np.interp(time_s, grid_s, column) for column in velocity_m_s.T], axis=1)
 
 
@@ -208,28 +204,27 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     time_s = trajectory.time_s
     grid_s, velocity_m_s = _grid_velocity(trajectory, step_s)
     # Speeds are interpolated between key frames, but not across gaps with lost tracking
-    is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(trajectory.time_s), 0.5))
+    is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(time_s), 0.5))
     speeds = [np.linalg.norm(velocity_m_s, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time_s, trajectory.rotation)(grid_s)
         rates_rad_s = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
         rates_rad_s = np.concatenate((rates_rad_s, rates_rad_s[-1:]))
-        sigma_samples = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
-        speeds.append(np.linalg.norm(gaussian_filter1d(rates_rad_s, sigma_samples, axis=0), axis=1))
+        speeds.append(np.linalg.norm(_smooth(rates_rad_s, time_s, step_s), axis=1))
     return speeds, is_known
 
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse_track, dense_track)]
+    spans_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
     step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
-    if min(spans_s) < 10 * step_s:
+    shorter_span_s = min(spans_s)
+    if shorter_span_s < 10 * step_s:
         return []
     (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
         _speeds(track, step_s) for track in (sparse_track, dense_track)
     )
-    min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_FRACTION * min(spans_s)) / step_s
-    min_count = min(min_count, 0.5 * min(spans_s) / step_s)
+    min_count = MIN_OVERLAP_FRACTION * shorter_span_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
     for a, b in zip(sparse_speeds, dense_speeds, strict=False):
@@ -251,11 +246,8 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
     # The n sparse samples begin at the dense sample k - (n - 1) for the correlation with index k
-    lags_s = (
-        (peak_indices - (len(is_known_sparse) - 1)) * step_s
-        + float(dense_track.time_s[0])
-        - float(sparse_track.time_s[0])
-    )
+    first_index = peak_indices - (len(is_known_sparse) - 1)
+    lags_s = first_index * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
 
@@ -347,25 +339,16 @@ def _refine_offset(
     Return None if too few poses overlap.
     """
     sparse_time_s = sparse_track.time_s
-    gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_track.time_s))
+    gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_time_s))
     # The same poses are used at every offset, so that the objective is continuous
-    window_offsets = (lag_s + shift for shift in (-window_s, 0.0, window_s))
-    is_known = np.all(
-        [
-            is_bracketed(sparse_time_s + offset, dense_track.time_s, gap_limit_s)
-            for offset in window_offsets
-        ],
-        axis=0,
-    )
-    pose_indices = np.flatnonzero(is_known)
-    time_fraction = min(
-        1.0,
-        float(dense_track.time_s[-1] - dense_track.time_s[0])
-        / float(sparse_time_s[-1] - sparse_time_s[0]),
-    )
-    if len(pose_indices) < max(
-        2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(sparse_time_s)
-    ):
+    is_known = [
+        is_bracketed(sparse_time_s + (lag_s + shift), dense_track.time_s, gap_limit_s)
+        for shift in (-window_s, 0.0, window_s)
+    ]
+    pose_indices = np.flatnonzero(np.all(is_known, axis=0))
+    time_fraction = min(1.0, float(np.ptp(dense_track.time_s) / np.ptp(sparse_time_s)))
+    min_pose_count = max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(sparse_time_s))
+    if len(pose_indices) < min_pose_count:
         return None
     pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
     sparse_time_s = sparse_time_s[pose_indices]

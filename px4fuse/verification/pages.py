@@ -251,10 +251,8 @@ class _PdfComparison:
 
         Values to compare later are appended to ``remaining_values``.
         """
-        submitted_keys, redrawn_keys = (
-            _compared_keys(submitted_dictionary, key),
-            _compared_keys(redrawn_dictionary, key),
-        )
+        submitted_keys = _compared_keys(submitted_dictionary, key)
+        redrawn_keys = _compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
             description = f"{feature} is missing"
@@ -280,9 +278,7 @@ class _PdfComparison:
             str(value) if isinstance(value, str) else value.decode("latin-1")
             for value in (submitted_value, redrawn_value)
         ]
-        if texts[0] == texts[1] or all(map(_TYPST_VERSION.fullmatch, texts)):
-            return True
-        return self.is_same_text(*texts)
+        return all(map(_TYPST_VERSION.fullmatch, texts)) or self.is_same_text(*texts)
 
     def _compare_streams(
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int

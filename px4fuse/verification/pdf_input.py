@@ -138,19 +138,14 @@ def open_strictly(pdf: bytes) -> pypdf.PdfReader:
 
 
 def _check_file(pdf: bytes) -> None:
-    for has_problem, reason in (
-        (
-            len(pdf) > MAX_PDF_BYTES,
-            f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB.",
-        ),
-        (
-            not pdf.startswith(b"%PDF-"),
-            "the file is not a PDF. Hand in the file that px4fuse wrote.",
-        ),
-        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand in the complete file."),
-    ):
-        if has_problem:
-            raise ResultsError(reason)
+    if len(pdf) > MAX_PDF_BYTES:
+        raise ResultsError(
+            f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
+        )
+    if not pdf.startswith(b"%PDF-"):
+        raise ResultsError("the file is not a PDF. Hand in the file that px4fuse wrote.")
+    if b"%%EOF" not in pdf[-2048:]:
+        raise ResultsError("the end of the PDF is missing. Hand in the complete file.")
     # every stream is inflated and discarded here, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
     for stream_match in _STREAM_START.finditer(pdf):
@@ -228,10 +223,7 @@ def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObjec
 def _foreign_features(dictionary: DictionaryObject, needs_click: bool) -> Iterator[str]:
     """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
     yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
-    action, dictionary_type = (
-        _pdf_name(dictionary.get("/S")) or "",
-        _pdf_name(dictionary.get("/Type")),
-    )
+    action, dictionary_type = (_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not needs_click:

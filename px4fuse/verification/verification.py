@@ -311,13 +311,10 @@ def _verify_with_log(
     status: Status = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
-    page_sentences = [
-        difference.sentence for difference in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]
-    ]
-    if len(page_differences) > MAX_LISTED_PAGE_DIFFERENCES:
-        page_sentences.append(
-            f"the PDF has {len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES} more differences"
-        )
+    sentences = [difference.sentence for difference in page_differences]
+    page_sentences = sentences[:MAX_LISTED_PAGE_DIFFERENCES]
+    if unlisted_count := len(sentences) - len(page_sentences):
+        page_sentences.append(f"the PDF has {unlisted_count} more differences")
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":
         reasons = page_sentences + reasons
@@ -331,12 +328,11 @@ def _verify_with_log(
         )
         remedy = remedy or f"Verify the report with {versions_text}."
     reasons += [LIMIT_NOTE] * (status == "verified")
-    listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
     return Verification(
         status,
         tuple(reasons),
         True,
-        listed_mismatches,
+        mismatches[:MAX_LISTED_DIFFERENCES],
         page_status,
         page_differences,
         redrawn_pdf,
@@ -453,10 +449,8 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     if first_text == second_text:
         return True
     # the split lists contain texts and numbers in turn
-    text_parts, other_text_parts = (
-        _NUMBER_PATTERN.split(first_text),
-        _NUMBER_PATTERN.split(second_text),
-    )
+    text_parts = _NUMBER_PATTERN.split(first_text)
+    other_text_parts = _NUMBER_PATTERN.split(second_text)
     numbers = zip(text_parts[1::2], other_text_parts[1::2], strict=False)
     return text_parts[::2] == other_text_parts[::2] and all(
         a == b or is_same_number(a, b) for a, b in numbers

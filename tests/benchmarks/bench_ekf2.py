@@ -154,7 +154,7 @@ def horizontal_rmse(summary: Summary) -> float:
     return float(np.hypot(*parts))
 
 
-def counterfactuals(models: dict[str, Model]) -> None:
+def check_what_if(models: dict[str, Model]) -> None:
     """Print and check predictions with other parameters, against ground truth."""
     clean = "v1.16.1_aisle_nominal"
     print("\nwhat if | mean NIS north, east | rejected | RMSE to truth m (as flown)")
@@ -224,7 +224,7 @@ def main(paths: list[Path], *, readme: bool) -> None:
     print(table := agreement_page(models, left))
     if readme:
         write_page(table)
-    counterfactuals(models)
+    check_what_if(models)
     flight = read_log(SAMPLE)
     model = open_model(flight)
     assert isinstance(model, Model), model

@@ -29,14 +29,16 @@ def main() -> None:
     from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
 
-    axis = compare(read_log(LOG), axes=("north",)).lines[0]
+    axis = compare(read_log(LOG), axes=("north",)).input_axes[0]
     single = seconds(lambda: replay(axis, Settings()), RUNS)
     print(f"KF replay {single:.2f} s")
     filter_tools.IMU_HZ, settings = 250.0, filter_tools.SETTINGS
     flight, _ = filter_tools.made_flight(1, duration_s=600.0, offset_s=-0.1)
     compared = compare(flight, settings)
     for names in (None, (HORIZONTAL,)):
-        took = seconds(lambda names=names: tune(compared.lines, settings, names, flight=flight))
+        took = seconds(
+            lambda names=names: tune(compared.input_axes, settings, names, flight=flight)
+        )
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
     took = seconds(lambda: estimate_noises_and_clock(compared))
     print(f"horizontal and clock offset, 600 s: {took:.1f} s (aim 2.5 s)")

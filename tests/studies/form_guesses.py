@@ -18,17 +18,17 @@ import numpy as np
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
+from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
 from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
 from px4fuse.results.answer_form import (
+    CHOICE_NAMES,
     CORRECTIONS,
     EKF2_BEHAVIOURS,
-    MAX_PREDICTIONS,
     MISTAKES,
     NOT_AVAILABLE,
     PANELS,
-    PREDICTION_RANGES,
     VERDICTS,
     Answers,
     StudentMistake,
@@ -47,12 +47,18 @@ def truth(number: int) -> FormTruth:
     return answer.form
 
 
-def guess_predictions(rng: np.random.Generator) -> tuple[str, ...]:
-    """Return random ranges for all predictions."""
-    return tuple(rng.choice(PREDICTION_RANGES, MAX_PREDICTIONS).tolist())
+def guess_choices(rng: np.random.Generator, one: FormTruth) -> tuple[str, ...]:
+    """Guess the fault of each figure, and give the answers to all questions for this fault."""
+    letters, count = [], len(QUESTIONS)
+    for first in range(0, len(one.choices), count):
+        guess = rng.choice(one.choices[first][0].options)
+        fault = next(each for each in FAULTS.values() if each.fault == guess)
+        for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
+            letters.append(CHOICE_NAMES[choice.options.index(getattr(fault, field))])
+    return tuple(letters)
 
 
-def at_random(rng: np.random.Generator) -> Answers:
+def at_random(rng: np.random.Generator, one: FormTruth) -> Answers:
     """Return a form with random valid answers."""
     named = [name for name in MISTAKES if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
@@ -71,7 +77,7 @@ def at_random(rng: np.random.Generator) -> Answers:
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
-        predictions=guess_predictions(rng),
+        choices=tuple(rng.choice(CHOICE_NAMES, len(one.choices)).tolist()),
     )
 
 
@@ -87,9 +93,9 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
         verdict_kf=common([one.kf.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
-        predictions=tuple(
-            common([one.predictions[index][1] for one in truths if len(one.predictions) > index])
-            for index in range(max(len(one.predictions) for one in truths))
+        choices=tuple(
+            common([one.choices[index][1] for one in truths])
+            for index in range(len(truths[0].choices))
         ),
     )
     if kind == "none":
@@ -130,7 +136,7 @@ def right(one: FormTruth) -> Answers:
         verdict_ekf2=one.ekf2.verdict or NOT_AVAILABLE,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
         quantities=one.quantities,
-        predictions=tuple(name for _, name in one.predictions),
+        choices=tuple(letter for _, letter in one.choices),
     )
 
 
@@ -152,7 +158,7 @@ def main() -> None:
                 for kind in kinds}  # fmt: skip
         kind = max(best, key=lambda each: best[each])
         for what, form, times in (
-            ("right", right, 1), ("random", lambda _: at_random(rng), GUESSES),
+            ("right", right, 1), ("random", lambda one: at_random(rng, one), GUESSES),
             ("none", lambda _: none, 1),
         ):  # fmt: skip
             shares = [form_points(form(one), one).fraction for one in group for _ in range(times)]

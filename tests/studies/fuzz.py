@@ -58,7 +58,7 @@ from px4fuse.results import answer_form  # noqa: E402
 from px4fuse.results.build import outcome_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
-from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
+from px4fuse.trajectory.graph.solver import analyse_graph  # noqa: E402
 from px4fuse.verification.pdf_input import read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent

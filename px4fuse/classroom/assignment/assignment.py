@@ -9,6 +9,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from px4fuse.classroom.assignment.figures import draw_choices, draw_figures
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
@@ -17,7 +18,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     draw_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import draw_predictions, form_truth
+from px4fuse.classroom.assignment.truth import form_truth
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
@@ -49,10 +50,8 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]
-    draw_number = partial(draw_uniform, secret, student.student_id, kind)
-    form = replace(
-        form_truth(simulation, sha256), predictions=draw_predictions(simulation, draw_number)
-    )
+    choices = draw_choices(partial(draw_uniform, secret, student.student_id, kind))
+    form = replace(form_truth(simulation, sha256), choices=choices)
     return log, RightAnswers(
         student_id=student.student_id,
         name=student.name,
@@ -94,7 +93,7 @@ def assign(
     truth: bool = True,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[AnswerKey, int]:
-    """Write the log and the answer form of each student to a folder, and the answer key.
+    """Write log, answer form and figures of each student to a folder, and the answer key.
 
     Students can be added to an existing key. Existing files are not replaced: they must be equal.
 
@@ -138,15 +137,18 @@ def assign(
         log, answer = simulate_assigned_flight(secret, student, kind, count, truth)
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_extension(key_file, stored_answer.sha256 == answer.sha256)
-        predictions = stored_answer.form.predictions if stored_answer.form else ()
-        questions = [question for question, _ in predictions]
-        form = form_text(student.file, answer.sha256, questions).encode()
+        choices = stored_answer.form.choices if stored_answer.form else ()
+        form = form_text(student.file, answer.sha256, [choice for choice, _ in choices]).encode()
         content_by_path = {folder / student.file: log, folder / form_name(student.file): form}
         missing_content_by_path = {
             path: content
             for path, content in content_by_path.items()
             if not _is_written(path, content)
         }
+        figures_file = folder / Path(student.file).with_suffix(".png")
+        if not figures_file.exists():
+            draw_number = partial(draw_uniform, secret, student.student_id, kind)
+            missing_content_by_path[figures_file] = draw_figures(draw_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the answer key is written before the log, because an interrupted run needs its secret
         write_all({key_file: key_text(key).encode()})

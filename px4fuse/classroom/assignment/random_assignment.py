@@ -10,6 +10,7 @@ import hashlib
 import hmac
 import math
 from bisect import bisect
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
@@ -40,9 +41,12 @@ LOOP_FRACTION = 1 / 3
 # Range of the difficulty of an injected fault: smallest size that px4fuse detects, divided by the
 # size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
+# Fraction of the flights whose faults are smaller than those that px4fuse detects, so that its
+# findings are not the right answers, and the largest difficulty of these flights
+UNDETECTABLE_FRACTION, UNDETECTABLE_DIFFICULTY = 0.25, 1.5
 
 
-class AssignableMistake(Record, frozen=True):
+class AssignableMistake(Record):
     """Injected fault of a simulated flight that can be assigned to a student.
 
     Attributes
@@ -95,7 +99,7 @@ class AssignableMistake(Record, frozen=True):
         return f"{text},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
 
 
-class DrawingRules(Record, frozen=True):
+class DrawingRules(Record):
     """Possible injected faults of a kind of flight, and ranges of random numbers (``drawn.toml``).
 
     ``numbers`` are minimum, maximum and decimals, by field of the scenario.
@@ -105,7 +109,7 @@ class DrawingRules(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = read_toml(__file__, "drawn.toml", dict[ScenarioKind, DrawingRules])
+RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, DrawingRules], "drawn.toml")
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,7 @@ class AssignedFlight:
         Values of ``px4fuse simulate --mistake``.
     difficulty : float
         Difficulty of the most difficult injected fault; HARDEST_DIFFICULTY without a fault.
+        Above HARDEST_DIFFICULTY, px4fuse may not detect the fault.
     """
 
     scenario: Scenario
@@ -127,11 +132,16 @@ class AssignedFlight:
     difficulty: float
 
 
-def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
-    """Return a random number in [0, 1) that secret, student, kind and label determine."""
+def draw_bits(secret: bytes, student_id: str, kind: FlightKind, label: str) -> int:
+    """Return a random number of 128 bits that secret, student, kind and label determine."""
     message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
-    return int.from_bytes(digest[:7], "big") / 2**56
+    return int.from_bytes(digest[:16], "big")
+
+
+def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
+    """Return a random number in [0, 1), the first 53 bits of :func:`draw_bits`."""
+    return (draw_bits(secret, student_id, kind, label) >> 75) / 2**53
 
 
 def draw(
@@ -179,22 +189,33 @@ def draw(
     for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):
         if len(mistakes) < mistake_count and all(map(mistake.is_detectable_with, mistakes)):
             mistakes.append(mistake)
+    low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
+    if draw_number("undetectable") < UNDETECTABLE_FRACTION:
+        low, high = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
     difficulties, options = [], []
     for mistake in mistakes:
         name, difficulty = mistake.mistake, EASIEST_DIFFICULTY
         if mistake.detectable_size is not None:
-            difficulty += (HARDEST_DIFFICULTY - difficulty) * draw_number(f"size {name}")
+            difficulty = low + (high - low) * draw_number(f"size {name}")
         sign = -1.0 if mistake.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
         difficulties.append(difficulty)
         options.append(mistake.format_option(difficulty, sign, draw_number(f"at {name}")))
-    numbers: dict[str, Any] = {
-        name: round(low + (high - low) * draw_number(name), decimals)
-        for name, (low, high, decimals) in rules.numbers.items()
-    }
-    has_truth, seed = truth and kind == "aisle", int(draw_number("seed") * 2**32)
-    scenario = make_scenario(kind, truth=has_truth, seed=seed, **numbers)
+    scenario = make_scenario(
+        kind,
+        truth=truth and kind == "aisle",
+        seed=draw_bits(secret, student_id, kind, "seed"),
+        **draw_numbers(kind, draw_number),
+    )
     difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
     return AssignedFlight(scenario, tuple(options), round(difficulty, 2))
+
+
+def draw_numbers(kind: ScenarioKind, draw_number: Callable[[str], float]) -> dict[str, Any]:
+    """Draw the numbers of a scenario of this kind, by field."""
+    return {
+        name: round(low + (high - low) * draw_number(name), decimals)
+        for name, (low, high, decimals) in RULES_BY_KIND[kind].numbers.items()
+    }
 
 
 def encode_secret(text: str, source_name: str) -> bytes:

@@ -23,7 +23,7 @@ MAX_STEM_LENGTH = 48
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-TITLES_BY_FIELD = read_toml(__file__, "columns.toml", dict[str, tuple[str, ...]])
+TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
 # Fields of a student that are copied from another list if the class list does not contain them
 FIELDS_OF_OTHER_LISTS = ("name", "email", "login", "submission_time", "extended_due")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation

@@ -1,8 +1,7 @@
 """Right answers to the answer form about a simulated flight."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,10 +26,9 @@ from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
     GATE_QUESTION_UPDATES,
-    PREDICTION_RANGES,
+    Choice,
+    ChoiceName,
     FormQuestion,
-    Prediction,
-    RangeName,
     draw_questions,
 )
 from px4fuse.simulation import flights
@@ -48,13 +46,11 @@ MIN_RESET_M = 0.2
 # Time (s) from the start of the flight in which position resets are ignored: EKF2 resets to its
 # first position
 IGNORED_RESETS_S = 5.0
-# Ratio of the upper to the lower limit of a range from which the student chooses
-PREDICTION_RANGE_FACTOR = 1.35
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
-BEHAVIOUR_RULES = read_toml(__file__, "did.toml", dict[str, dict[str, set[str]]])
+BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
-class TrueMistake(Record, frozen=True):
+class TrueMistake(Record):
     """Injected fault of a simulated flight, with the limits of right answers.
 
     Attributes
@@ -75,7 +71,7 @@ class TrueMistake(Record, frozen=True):
     until_s: float | None = None
 
 
-class VerdictTruth(Record, frozen=True):
+class VerdictTruth(Record):
     """Right verdict on the reported σ of a filter, and the factor by which σ is wrong.
 
     ``verdict`` is "" if the flight has too few data for a verdict.
@@ -85,7 +81,7 @@ class VerdictTruth(Record, frozen=True):
     factor: float | None = None
 
 
-class FormTruth(Record, frozen=True):
+class FormTruth(Record):
     """Right answers to the answer form about one flight.
 
     Attributes
@@ -99,6 +95,8 @@ class FormTruth(Record, frozen=True):
     quantities : tuple
         Answers to :func:`px4fuse.results.answer_form.draw_questions`; None if the flight is too
         short.
+    choices : tuple
+        Questions about the figures, with the letter of the right answer.
     """
 
     mistakes: tuple[TrueMistake, ...]
@@ -108,13 +106,13 @@ class FormTruth(Record, frozen=True):
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
-    predictions: tuple[tuple[Prediction, RangeName], ...] = ()
+    choices: tuple[tuple[Choice, ChoiceName], ...] = ()
 
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """Compute the right answers from a simulation and its analysis with default settings."""
     answer = flights.answer(simulation)
-    comparison = _compare(simulation)
+    comparison = compare_simulation(simulation)
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
@@ -130,53 +128,15 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     )
 
 
-def _compare(simulation: flights.Simulation) -> Comparison:
+def compare_simulation(simulation: flights.Simulation) -> Comparison:
+    """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    prepared = prepare(flight, ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M))
+    prepared = prepare(
+        flight,
+        ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
+        as_sent=True,  # assigned logs are analysed without corrections, too
+    )
     return compare(prepared, run_kf(prepared))
-
-
-def draw_predictions(
-    simulation: flights.Simulation, draw_number: Callable[[str], float]
-) -> tuple[tuple[Prediction, RangeName], ...]:
-    """Simulate the flight with one change, and return questions about the results.
-
-    Each question has five ranges and the right range. A student cannot compute the results, because
-    only the instructor has the seed of the flight. ``draw_number`` returns a random number in
-    [0, 1) for a label. The right range is drawn at random, so that the limits do not show it.
-    """
-    scenario = replace(simulation.scenario, truth=True)
-    noise_name = "sigma_vio_m" if scenario.kind == "loop" else "sigma_uwb_m"
-    noisy_scenario = replace(scenario, **{noise_name: 2.0 * getattr(scenario, noise_name)})
-    changed_simulations = {
-        "if the flight had no faults": flights.simulate(scenario),
-        "if the position noise (1 σ) were twice as large": flights.simulate(
-            noisy_scenario, simulation.mistakes
-        ),
-    }
-    predictions: list[tuple[Prediction, RangeName]] = []
-    for change_text, changed_simulation in changed_simulations.items():
-        for filter_name, summary in _compare(changed_simulation).main.filters.items():
-            truth = summary.truth
-            value_by_quantity = {
-                "mean NIS": None if isinstance(summary, Unavailable) else summary.nis_mean,
-                "position RMSE against ground truth (m)": None
-                if isinstance(truth, Unavailable)
-                else truth.position_rmse_m,
-            }
-            for quantity, value in value_by_quantity.items():
-                if value is None or not value > 0.0:
-                    continue
-                text = f"{quantity} of {filter_name.upper()} {change_text}"
-                right_index = int(draw_number(f"range {text}") * len(PREDICTION_RANGES))
-                # keep the value away from the limits of the right range
-                value_index = right_index - 0.2 - 0.6 * draw_number(f"place {text}")
-                first, second, third, fourth = (
-                    value * PREDICTION_RANGE_FACTOR ** (index - value_index) for index in range(4)
-                )
-                prediction = Prediction(text, (first, second, third, fourth))
-                predictions.append((prediction, PREDICTION_RANGES[right_index]))
-    return tuple(predictions)
 
 
 def _true_mistake(

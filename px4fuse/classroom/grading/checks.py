@@ -18,7 +18,7 @@ from msgspec import Meta
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.core.record import OrUnavailable, Share
+from px4fuse.core.record import Share
 from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import ClockOffset
@@ -31,7 +31,6 @@ from px4fuse.results.contract import (
     ReportedResults,
     to_json_dict,
 )
-from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
@@ -452,18 +451,13 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 
 # Maximum distance (m) between take-off and landing place of a closed loop
 MAX_LANDING_DISTANCE_M = 0.5
-# Fraction of the points for a smaller ATE if the report has no reference for computing an ATE
-NO_REFERENCE_FRACTION = 0.5
+CORRECTIONS: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
 
 
 class LoopItem(RubricItem, frozen=True, tag="loop"):
-    """Check a loop: each of four conditions gives a quarter of the points.
+    """Check a loop: a quarter of the points for a measured loop closure error.
 
-    1. The loop closure error is measured.
-    2. The loop closure is accepted.
-    3. The path is corrected.
-    4. The corrected path has a smaller ATE.
-
+    A report with an accepted closure has half of the points, and with a corrected path all points.
     If the vehicle did not land at the take-off place according to the answer key, a report without
     an accepted closure gets all points.
     """
@@ -489,52 +483,14 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
         fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
-            correction_fraction, correction_comment = _score_corrections(loop.corrections)
-            fraction = 0.5 + correction_fraction
-            comment = f"A loop closure was accepted. {correction_comment}"
+            paths = map(loop.corrections.get, CORRECTIONS)
+            is_corrected = any(isinstance(path, CorrectedPath) for path in paths)
+            fraction = 1.0 if is_corrected else 0.5
+            comment = (
+                "A loop closure was accepted, and the path was "
+                f"{'' if is_corrected else 'not '}corrected."
+            )
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
         return fraction, (
             f"You measured a loop closure error of {error_text} after {path_text}. {comment}"
         )
-
-
-def _score_corrections(
-    corrections: Mapping[CorrectionName, OrUnavailable[CorrectedPath]],
-) -> FractionAndReason:
-    """Score conditions 3 and 4 of :class:`LoopItem`: 0.25 for each."""
-    correction_names: tuple[CorrectionName, ...] = (
-        "by_distance_plain",
-        "by_distance",
-        "pose_graph_gated",
-    )
-    paths = map(corrections.get, correction_names)
-    corrected_paths = [path for path in paths if isinstance(path, CorrectedPath)]
-    if not corrected_paths:
-        return 0.0, "The path was not corrected."
-    ate_before_m = _ate_by_reference(corrections.get("uncorrected"))
-    ate_pairs_m = [
-        (ate_before_m[name], after_m)
-        for correction in corrected_paths
-        for name, after_m in _ate_by_reference(correction).items()
-        if ate_before_m.get(name)
-    ]
-    if not ate_pairs_m:
-        return 0.25 + 0.25 * NO_REFERENCE_FRACTION, (
-            "The path was corrected. The report contains no ATE: add a trajectory with --reference."
-        )
-    before_m, after_m = min(ate_pairs_m, key=lambda pair: pair[1] / pair[0])
-    is_better = after_m < before_m
-    advice = "" if is_better else " Explain why the correction increases the error."
-    return 0.25 + 0.25 * is_better, (
-        f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m.{advice}"
-    )
-
-
-def _ate_by_reference(correction: object) -> dict[str, float]:
-    """Return the ATE (m) of a corrected path against each reference trajectory."""
-    scores = correction.scores if isinstance(correction, CorrectedPath) else {}
-    return {
-        name: score.ate.translation_m.rmse
-        for name, score in scores.items()
-        if isinstance(score, Evaluation)
-    }

@@ -21,6 +21,8 @@ from px4fuse.verification.model import Verification
 
 # Minimum number of equal numbers in two answer forms for flagging them as copies
 MIN_SAME_NUMBERS = 3
+# Minimum number of letters about figures for a comparison of the answers of two students
+MIN_SAME_LETTERS = 6
 # Maximum relative difference of two equal numbers: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
 # Minimum fraction of the log that --start and --end must include; otherwise a flag is raised
@@ -153,6 +155,15 @@ EQUAL_CONTENT_CHECKS: tuple[
             and tuple(report.numbers.values())
         ),
         attrgetter("log_sha256"),
+    ),
+    (
+        "The answers about the figures are those of {}, whose figures differ.",
+        lambda report: (
+            report.form
+            and sum(map(bool, report.form.choices)) >= MIN_SAME_LETTERS
+            and report.form.choices
+        ),
+        _student_key,
     ),
 )
 

@@ -8,6 +8,7 @@ guessed without a measurement has points only with the correct size.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import NamedTuple
 
 import msgspec
@@ -15,17 +16,18 @@ import msgspec
 from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
+    CHOICE_NAMES,
     MISTAKES,
     NO_MISTAKE_KIND,
     NOT_AVAILABLE,
-    PREDICTION_RANGES,
     Answers,
     QuantityAnswer,
     StudentMistake,
+    draw_questions,
 )
 
-# Fraction of the points for the diagnosis if the answer key has predictions: a student can copy the
-# diagnosis from the output of px4fuse, but not the predictions
+# Fraction of the points for the diagnosis if the answer key has choices: a student can copy the
+# diagnosis from the output of px4fuse, but not the answers about the figures
 DIAGNOSIS_SHARE = 0.2
 # Points deducted for each false fault
 FALSE_MISTAKE_POINTS = 10.0
@@ -68,7 +70,7 @@ class _CorrectionRule(NamedTuple):
     right_values: tuple[float, float] | str = ANY_BOUNDS
 
 
-POINTS_TABLE = read_toml(__file__, "form_points.toml", dict)
+POINTS_TABLE = read_toml(__file__, dict)
 CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
 NEIGHBOURS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(POINTS_TABLE["weights"])
@@ -89,7 +91,8 @@ class FormPoints:
 
     @property
     def fraction(self) -> float:
-        return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
+        points = sum(self.points_by_part.values())
+        return max(points, 0.0) / sum(self.max_points_by_part.values())
 
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
@@ -101,11 +104,10 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.mistakes and len(false_mistakes) < MIN_FALSE_MISTAKES_WITHOUT_POINTS:
         fractions |= _mistake_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
-    # half of the points for the verdicts if no computed number is right, because most verdicts can
-    # be guessed
-    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (
-        1.0 if quantities_fraction else 0.5
-    )
+    # half of the points for the verdicts on a flight with faults if no computed number is right,
+    # because most verdicts can be guessed
+    is_guess_possible = not quantities_fraction and not is_no_mistake_right
+    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (0.5 if is_guess_possible else 1.0)
     points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
     if is_no_mistake_right:
         points_by_part["mistakes"] = weights["mistakes"]
@@ -115,18 +117,16 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
-    if truth.predictions:
+    if truth.choices:
         weights = {name: DIAGNOSIS_SHARE * points for name, points in weights.items()}
-        weights["predictions"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
+        weights["figures"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
         points_by_part = {name: DIAGNOSIS_SHARE * points for name, points in points_by_part.items()}
-        points_by_part["predictions"] = weights["predictions"] * _prediction_fraction(
-            answers, truth
-        )
+        points_by_part["figures"] = weights["figures"] * _choices_fraction(answers, truth)
     named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     is_named_by_kind = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
     feedback = (
         *_mistake_feedback(matches, false_mistakes, is_no_mistake_right),
-        *_prediction_feedback(answers, truth),
+        *_answer_feedback(answers, truth),
     )
     return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
 
@@ -167,15 +167,33 @@ def describe_right_answer(mistake: TrueMistake) -> str:
     return ", ".join([*texts, f"shown in {' or '.join(panels_showing(mistake.kind))}"])
 
 
-def _prediction_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
-    """Yield a clause with the right range for each prediction that is wrong or missing."""
-    named_ranges = dict(enumerate(answers.predictions))
-    for index, (question, right_range) in enumerate(truth.predictions):
-        if named_ranges.get(index) != right_range:
-            yield (
-                f"p{index + 1}, {question.quantity}: range {right_range} is right, you gave "
-                f"{named_ranges.get(index) or 'none'}"
-            )
+def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
+    """Yield a clause with the right answer to each further question that is not answered right."""
+    rows: list[tuple[str, object, object]] = [
+        ("verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
+        ("verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
+    ]
+    if _ekf2_behaviour_fraction(answers, truth) < 1.0:
+        rows.append(("behaviour of EKF2", answers.ekf2_did, truth.ekf2_did))
+    for question, given, right in zip_longest(
+        draw_questions(answers.log_sha256), answers.quantities, truth.quantities
+    ):
+        if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
+            rows.append((f"{question.text}, within {FULL_POINTS_TOLERANCE:.0%}", given, right))
+    for letter, (choice, right_letter) in zip_longest(
+        answers.choices[: len(truth.choices)], truth.choices
+    ):
+        given_text = choice.answer_text(letter) if letter else ""
+        rows.append((choice.question, given_text, choice.answer_text(right_letter)))
+    for name, given, right in rows:
+        if given != right:
+            yield f"{name}: {_format_answer(right)} is right, you gave {_format_answer(given)}"
+
+
+def _format_answer(answer: object) -> str:
+    if isinstance(answer, tuple):
+        return ", ".join(map(_format_answer, answer)) or "none"
+    return f"{answer:.4g}" if isinstance(answer, float | int) else f"'{answer or 'none'}'"
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
@@ -354,16 +372,16 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
     return 1.0 if is_complete and not false_count else 0.5
 
 
-def _prediction_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for predictions; guesses have no points on average."""
-    wrong_points = -1.0 / (len(PREDICTION_RANGES) - 1)
-    right_ranges = (right_range for _, right_range in truth.predictions)
+def _choices_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for choices: negative, so that guesses average to zero."""
+    wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
+    right_letters = (right_letter for _, right_letter in truth.choices)
     points = (
-        1.0 if named_range == right_range else wrong_points
-        for named_range, right_range in zip(answers.predictions, right_ranges, strict=False)
-        if named_range
+        1.0 if letter == right_letter else wrong_points
+        for letter, right_letter in zip(answers.choices, right_letters, strict=False)
+        if letter
     )
-    return max(sum(points) / len(truth.predictions), 0.0)
+    return sum(points) / len(truth.choices)
 
 
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:

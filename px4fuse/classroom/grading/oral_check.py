@@ -31,7 +31,7 @@ def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
 
 
 def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
-    """Yield questions on a completed form: errors first, then right answers and the verdict."""
+    """Yield questions on a completed form: about its faults, then about figures, errors first."""
     named_kinds = [mistake.kind for mistake in form.mistakes]
     true_kinds = [mistake.kind for mistake in truth.mistakes]
     flight_text = ", ".join(true_kinds) or "no fault"
@@ -60,24 +60,11 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             f"{describe_right_answer(mistake)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )
-    given_ranges = dict(enumerate(form.predictions))
-    for index, (prediction, right_range) in enumerate(truth.predictions):
-        given_range = given_ranges.get(index) or "none"
+    letters = dict(enumerate(form.choices))
+    questions = [(*each, letters.get(index)) for index, each in enumerate(truth.choices)]
+    for choice, right_letter, letter in sorted(questions, key=lambda each: each[1] == each[2]):
+        answer_text = choice.answer_text(letter) if letter else "none"
         yield (
-            f"For the {prediction.quantity} you gave range {given_range}. Is this more or less "
-            "than in your flight, and why?",
-            f"Range {right_range} is right. The reason names what the change does to the "
-            "innovations, and to R or Q.",
-        )
-    for filter_name, given_verdict, true_verdict in (
-        ("KF", form.verdict_kf, truth.kf),
-        ("EKF2", form.verdict_ekf2, truth.ekf2),
-    ):
-        factor = true_verdict.factor
-        factor_text = "" if factor is None else f" (σ is wrong by a factor of {factor:.2g})"
-        yield (
-            f"Your verdict on {filter_name} is: {given_verdict or 'blank'}. Which number of the "
-            "report shows it?",
-            f"{true_verdict.verdict or 'No verdict is possible'}{factor_text}: the mean NIS, and "
-            "the ratio of the errors to the reported σ.",
+            f"{choice.question}: your answer is: {answer_text}. Explain it with the figure.",
+            f"Right: {choice.answer_text(right_letter)}.",
         )

@@ -151,15 +151,9 @@ def write_class(
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    outputs = [
-        "class.csv",
-        "items.csv",
-        "class.html",
-        *[REPORTS_FOLDER] * has_redrawn,
-        FEEDBACK_FOLDER,
-        *[QUESTIONS_FILE] * (QUESTIONS_FILE in contents),
-    ]
-    outputs += [GRADES_FOLDER] * bool(course.worksheets) + [OVERRIDES_NAME]
+    outputs = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
+    if has_redrawn:
+        outputs[REPORTS_FOLDER] = None
     return tuple(output / name for name in outputs), tuple(notes)
 
 

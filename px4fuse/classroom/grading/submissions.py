@@ -68,7 +68,7 @@ GRADESCOPE_METADATA = "submission_metadata.yml"
 # Pattern of the file paths in an export, by learning platform
 PLATFORMS = {
     name: re.compile(pattern)
-    for name, pattern in read_toml(__file__, "platforms.toml", dict[str, str]).items()
+    for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
 # Texts that a platform writes once into a path: the student wrote any further occurrence
 _PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")

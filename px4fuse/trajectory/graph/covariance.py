@@ -17,7 +17,7 @@ GATE_ALPHA = 0.001
 _MIN_EIGENVALUE = 1e-13
 
 
-class GateResult(Record, frozen=True):
+class GateResult(Record):
     """Test of a loop closure against odometry.
 
     Attributes

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
-from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
+from px4fuse.trajectory.graph.model import PoseGraph, normal_equations, solve_normal_equations
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:

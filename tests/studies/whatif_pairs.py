@@ -1,6 +1,6 @@
 """Predictions of EKF2 with another parameter, compared with flights that use it.
 
-``python tests/studies/counterfactuals.py [SEEDS] [outdoor]`` simulates pairs of flights that
+``python tests/studies/whatif_pairs.py [SEEDS] [outdoor]`` simulates pairs of flights that
 differ in one EKF2 parameter only (same seed), predicts the second from the first, and prints for
 each pair the predicted and the flown mean NIS, rejected share and position error. At the end it
 prints how many were available, predictable and correct: NIS and error within 10 %, rejections

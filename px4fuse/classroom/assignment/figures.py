@@ -1,0 +1,159 @@
+"""Figures of further simulated flights, about which the answer form asks questions.
+
+A student gets the plots of these flights, but not their logs. Therefore px4fuse cannot analyse
+these flights, and its functions do not help to answer the questions.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from io import BytesIO
+
+import pandas as pd
+
+from px4fuse.card.model import FILTER_NAMES
+from px4fuse.classroom.assignment.random_assignment import draw_numbers
+from px4fuse.classroom.assignment.truth import compare_simulation
+from px4fuse.comparison.comparison import position_errors
+from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.core.record import Record, read_toml
+from px4fuse.flight.model import Ekf2, Truth
+from px4fuse.report import panels, style
+from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.scenario import make_scenario
+
+FIGURE_COUNT = 3
+# Number of passes along the aisle of a flight in a figure
+PASSES = 4
+# Minimum speed (m/s) along the aisle of the times with a grey background
+MIN_GREY_SPEED_M_S = 0.2
+# Questions about each figure, by the field of FigureFault that contains the right answer
+QUESTIONS = {
+    "fault": "injected fault",
+    "evidence": "plots that show the fault, and that do not show it",
+    "change": "smallest change that makes both filters consistent",
+    "prediction": "effect if SIGMA_Z and EKF2_EVP_NOISE were three times as large",
+    "useless": "change that does not help, and the reason",
+}
+
+
+class FigureFault(Record):
+    """Injected fault of a flight in a figure (``figures.toml``), and right answers about it.
+
+    ``option`` is the value of ``px4fuse simulate --mistake``, or "" without a fault.
+    """
+
+    fault: str
+    evidence: str
+    change: str
+    prediction: str
+    useless: str
+    option: str = ""
+
+
+FAULTS = read_toml(__file__, dict[str, FigureFault])
+
+
+def _shuffle(names: Iterable[str], label: str, draw_number: Callable[[str], float]) -> list[str]:
+    return sorted(names, key=lambda name: draw_number(f"{label} {name}"))
+
+
+def _draw_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
+    """Draw the fault of each figure, by the title of the figure."""
+    kinds = _shuffle(FAULTS, "figures", draw_number)[:FIGURE_COUNT]
+    return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
+
+
+def draw_choices(
+    draw_number: Callable[[str], float],
+) -> tuple[tuple[Choice, ChoiceName], ...]:
+    """Draw the questions about the figures, with the letters of the right answers.
+
+    ``draw_number`` returns a random number in [0, 1) for a label.
+    """
+    choices = []
+    for title, kind in _draw_kinds(draw_number).items():
+        other_kinds = _shuffle(FAULTS.keys() - {kind}, f"{title} other", draw_number)
+        kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
+        for field, question in QUESTIONS.items():
+            shuffled_kinds = _shuffle(kinds, f"{title} {field}", draw_number)
+            options = tuple(getattr(FAULTS[each], field) for each in shuffled_kinds)
+            right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
+            choices.append((Choice(f"{title}: {question}", options), right_letter))
+    return tuple(choices)
+
+
+def draw_figures(draw_number: Callable[[str], float]) -> bytes:
+    """Simulate and analyse the flights of the figures, and draw them as a PNG file."""
+    comparisons = {}
+    for title, kind in _draw_kinds(draw_number).items():
+
+        def draw_own_number(label: str, title: str = title) -> float:
+            return draw_number(f"{title} {label}")
+
+        numbers = draw_numbers("aisle", draw_own_number)
+        seed = int(2**53 * draw_own_number("seed"))
+        scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
+        mistakes = parse_mistakes(tuple(filter(None, [FAULTS[kind].option])))
+        comparisons[title] = compare_simulation(flights.simulate(scenario, mistakes))
+    return _figures_png(comparisons)
+
+
+def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
+    """Draw innovations, position errors and map of each flight in a row, by title."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - slow import
+
+    content = BytesIO()
+    with style.report_style():
+        picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
+        rows = picture.subplots(len(comparisons), 4, squeeze=False)
+        for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
+            result = comparison.main.in_flight
+            axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
+            panels.draw_innovations(axes[0], result)
+            for axis, filter_name in zip(axes[1:3], FILTERS, strict=True):
+                _draw_errors(axis, result, filter_name)
+            for axis in axes[:3]:
+                style.label_time_axis(axis, with_time_label=True)
+            _draw_map(axes[3], comparison)
+        picture.savefig(content, format="png", dpi=90, metadata={"Software": None})
+    return content.getvalue()
+
+
+def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
+    """Draw the position errors of a filter with ±2σ; times of flight along the axis are grey."""
+    name, errors, truth = (
+        FILTER_NAMES[filter_name],
+        position_errors(result, filter_name),
+        result.truth,
+    )
+    axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
+    assert isinstance(errors, pd.DataFrame)
+    assert isinstance(truth, pd.DataFrame)
+    colour = style.SIGMA_BAND_COLOURS[name]
+    style.draw_sigma_band(axes, 0.0 * errors["error_m"], errors["sigma_m"], colour)
+    style.draw_curve(axes, errors["error_m"], **style.TRACK_LINES[name])
+    axes.fill_between(
+        truth.index,
+        0.0,
+        1.0,
+        where=truth["velocity_m_s"] > MIN_GREY_SPEED_M_S,
+        transform=axes.get_xaxis_transform(),
+        color="0.9",
+        zorder=0,
+    )
+
+
+def _draw_map(axes: style.Axes, comparison: Comparison) -> None:
+    axes.set_title("Map: positions (dots), EKF2, ground truth (dotted)")
+    ekf2, truth = comparison.flight.ekf2, comparison.flight.truth
+    assert isinstance(ekf2, Ekf2)
+    assert isinstance(truth, Truth)
+    dots = style.MEASUREMENT_DOTS | {"ms": 4.0}
+    for track, line in (
+        (comparison.source.samples, dots),
+        (ekf2.state, style.TRACK_LINES["EKF2"]),
+        (truth.samples, style.TRACK_LINES["ground truth"]),
+    ):
+        axes.plot(track["east_m"], track["north_m"], **line)
+    style.set_map_axes(axes, "east", "north")

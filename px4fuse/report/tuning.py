@@ -1,0 +1,56 @@
+"""Terminal output of ``px4fuse tune``: SIGMA_A and SIGMA_Z along each axis."""
+
+from px4fuse.comparison.model import PreparedComparison
+from px4fuse.filter.tuning import AxisTuning
+from px4fuse.flight.model import Unavailable
+from px4fuse.report.page import Page
+from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
+from px4fuse.report.style import MUTED_COLOUR
+
+TUNING_HEAD = (
+    "axis",
+    "SIGMA_A (m/s²)\nvalue, 95 %",
+    "SIGMA_Z (m)\nvalue, 95 %",
+    "log-likelihood\ngain (nats)",
+    "gain on\n2nd half",
+    "autocorrelation\nbefore, after",
+)
+TUNING_NOTE = (
+    "The log-likelihood gain is the increase per measurement from the chosen settings to the "
+    "estimates. For the gain on the 2nd half of the data, the noises are estimated on the first "
+    "half. The autocorrelation of the innovations is at lag 1, with the chosen settings (before) "
+    "and with the estimates (after)."
+)
+
+
+def summary(comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
+    """Format the estimates of SIGMA_A and SIGMA_Z along each axis."""
+    page, rows, sentences = Page(), [], list[str]()
+    for name, tuning in tunings.items():
+        if isinstance(tuning, Unavailable):
+            sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
+            continue
+        held_out_gain = correlation_text = ""
+        if not isinstance(tuning.held_out, Unavailable):
+            held_out_gain = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
+        if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
+            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
+            correlation_text = f"{before:+.2f} {after:+.2f}"
+        rows.append(
+            [
+                name,
+                format_noise_estimate(tuning.sigma_a_two_state),
+                format_noise_estimate(tuning.sigma_z),
+                f"{tuning.log_likelihood_gain_per_measurement:.3f}",
+                held_out_gain,
+                correlation_text,
+            ]
+        )
+    page.write_labelled("Chosen", format_settings(comparison.settings))
+    if rows:
+        page.table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
+        sentences.append(TUNING_NOTE)
+    for text in sentences:
+        page.write(text, colour=MUTED_COLOUR)
+    page.write_labelled_texts(tuning_advice(comparison, tunings))
+    return page

@@ -1,0 +1,46 @@
+"""Figures of an assignment: questions, right answers and pictures."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from px4fuse.classroom.assignment import figures
+from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS, draw_choices, draw_figures
+from px4fuse.classroom.assignment.random_assignment import draw_uniform
+from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
+
+
+def test_choices_of_figure_have_one_right_answer_of_its_fault() -> None:
+    for number in range(20):
+        choices = draw_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
+        assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
+        for first in range(0, len(choices), len(QUESTIONS)):
+            rows = zip(choices[first:], QUESTIONS, strict=False)
+            right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
+            fault = next(each for each in FAULTS.values() if each.fault == right[0][0])
+            assert all(getattr(fault, field) == text for text, field in right)
+        form = form_text("s.ulg", "0" * 64, [choice for choice, _ in choices])
+        assert len(form.encode()) < MAX_FORM_BYTES
+
+
+def test_right_letters_of_figures_occur_equally_often() -> None:
+    draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
+    letters = [letter for draw_number in draws for _, letter in draw_choices(draw_number)]
+    for name in CHOICE_NAMES:
+        assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
+
+
+def test_answers_about_figures_differ_between_faults() -> None:
+    for field in QUESTIONS:
+        assert len({getattr(fault, field) for fault in FAULTS.values()}) == len(FAULTS)
+
+
+def test_figures_of_same_secret_and_student_are_equal(monkeypatch) -> None:
+    monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
+    draw_number = partial(draw_uniform, b"secret", "s1", "aisle")
+    content = draw_figures(draw_number)
+    assert content.startswith(b"\x89PNG")
+    assert content == draw_figures(draw_number)
+    assert content != draw_figures(partial(draw_uniform, b"secret", "s2", "aisle"))
