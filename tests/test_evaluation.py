@@ -417,6 +417,18 @@ def test_evaluate_frozen_estimate_scores_only_time_before() -> None:
     assert got.ate.translation_m.rmse < 1e-6
 
 
+@pytest.mark.parametrize(("restarts", "cause"), [(True, "restart of the map"), (False, "lost")])
+def test_evaluate_names_jump_of_estimate(restarts: bool, cause: str) -> None:
+    reference = flight()
+    middle, position_m = len(reference) // 2, reference.position_m.copy()
+    position_m[middle:] += position_m[0] - position_m[middle] if restarts else [3.0, 0.0, 0.0]
+    got = evaluate(replace(reference, position_m=position_m), reference)
+    assert cause in got.warnings[0]
+    jump_s = reference.time_s[middle] - reference.time_s[0]
+    assert f" m, {jump_s:.1f} s after its start" in got.warnings[0]
+    assert not any("scale factor" in warning for warning in got.warnings)
+
+
 def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
     truth = flight()
     vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")

@@ -144,6 +144,36 @@ def with_offset_truth(flight: Flight, *, grows: bool) -> Flight:
     return replace(flight, truth=replace(flight.truth, samples=samples))
 
 
+def with_errors(
+    errors: Callable[[pd.Index, pd.DataFrame], Any], late: Callable[[pd.Index], Any] = np.zeros_like
+) -> Change:
+    """Add errors (m), a function of time and velocity, and delays (s) of the timestamps."""
+
+    def change(flight: Flight) -> Flight:
+        samples = flight.positions[0].samples.copy()
+        time_s, true = samples.index, flight.truth.samples
+        velocity = pd.DataFrame(
+            {name: np.interp(time_s, true.index, np.gradient(true[name], true.index))
+             for name in Columns.POSITION[:2]}, index=time_s,
+        )  # fmt: skip
+        samples[Columns.POSITION[:2]] += errors(time_s, velocity)
+        return with_source(samples=samples.set_axis(time_s + (time_s > 1.0) * late(time_s)))(flight)
+
+    return change
+
+
+def no_errors(time_s: pd.Index, velocity: pd.DataFrame) -> Any:
+    return 0.0 * velocity
+
+
+def noise(count: int) -> Any:
+    return np.random.default_rng(4).normal(size=(count, 2))
+
+
+def jitter_s(time_s: pd.Index) -> Any:
+    return np.clip(0.03 * noise(len(time_s))[:, 0], -0.045, 0.045)
+
+
 def about(value: float, rel: float = 0.1) -> Any:
     return pytest.approx(value, rel=rel)
 
@@ -256,6 +286,18 @@ FAULTS = [
           {"damage": ("128 bytes do not form complete messages",)}),
     Fault("samples_out_of_order", "note", {"notes": 2}, change=with_log(dropped={"x": 2, "y": 1})),
     Fault("too_few_innovations", "warning", {"count": 7}, {"duration_s": 1.5}),
+    Fault("source_timestamp_jitter", "warning", {"jitter_s": about(0.0287, 0.01)},
+          {"uwb": Uwb(rate_hz=10.0, sigma_m=0.01)}, change=with_errors(no_errors, jitter_s)),
+    Fault("source_noise_grows_with_speed", "error", {"slow_m": about(0.163, 0.01)},
+          {"uwb": Uwb(rate_hz=10.0, sigma_m=0.05)},
+          change=with_errors(lambda t, v: np.hypot(*v.T.values)[:, None] * 0.4 * noise(len(t)))),
+    Fault("source_error_periodic", "error", {"period_s": about(7.0), "amplitude_m": about(0.3)},
+          change=with_errors(lambda t, _: 0.3 * np.sin(2.0 * np.pi * np.outer(t, [1, 0]) / 7.0))),
+    Fault("source_time_offset_changes", "error", {"most_s": about(0.12, 0.2)},
+          {"uwb": Uwb(rate_hz=20.0, sigma_m=0.02)},
+          change=with_errors(no_errors, lambda t: 0.12 * np.sin(2.0 * np.pi * t / 40.0))),
+    Fault("source_scale_error", "error", {"scale": about(1.25, 0.01)},
+          change=lambda f: with_source(samples=1.25 * f.positions[0].samples)(as_odometry(f))),
 ]  # fmt: skip
 # Findings tested in other files, with the estimates that they need
 TESTED_ELSEWHERE = {
@@ -269,8 +311,9 @@ TESTED_ELSEWHERE = {
     "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
     "source_noise_unequal_axes", "source_noise_varies", "source_orientation_copied",
     "source_orientation_wrong", "source_outliers", "source_position_jump",
-    "source_reported_variance_wrong", "source_samples_repeated", "source_scale_error",
-    "source_time_offset", "source_time_offset_changes", "source_timestamps_are_arrival_times",
+    "source_reported_variance_wrong", "source_samples_repeated",
+    "source_time_offset", "source_timestamps_are_arrival_times",
+    "attitude_late",
     "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
@@ -421,6 +464,15 @@ def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: 
     (finding,) = (one for one in found(compare(lost)) if "source" in one.id)
     assert (finding.id, finding.evidence["count"]) == ("source_gap_in_log", 1)
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
+
+
+@pytest.mark.parametrize("late_s", [0.1, -0.24])
+def test_late_attitude_is_reported_with_its_delay(late_s: float, sample_flight: Flight) -> None:
+    attitude = sample_flight.attitude
+    shifted = replace(sample_flight, attitude=attitude.set_axis(attitude.index + late_s))
+    (finding,) = (one for one in found(compare(shifted)) if one.id == "attitude_late")
+    assert finding.evidence["delay_s"] == pytest.approx(late_s, abs=0.021)
+    assert "attitude_late" not in ids(found(compare(sample_flight)))
 
 
 def test_each_reportable_fault_has_a_simulated_test_flight() -> None:

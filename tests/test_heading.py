@@ -63,6 +63,15 @@ def test_constant_heading_misalignment_is_recovered(misalignment_deg):
     assert found.sigma_deg < 3.0
 
 
+def test_gyro_bias_that_ekf2_removes_is_no_misalignment():
+    flight = simulated()
+    imu = flight.imu.copy()
+    imu[Columns.ANGULAR_RATE[2]] += 0.1
+    found = estimate(replace(flight, imu=imu))
+    assert not found.drifts
+    assert found.misalignment_deg == pytest.approx(0.0, abs=3.0 * found.sigma_deg)
+
+
 @pytest.mark.parametrize("by", ["positions", "orientation"])
 def test_drifting_heading_misalignment_is_estimated_over_time(by):
     """A source with an orientation gives the misalignment more accurately than positions."""

@@ -58,6 +58,12 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     assert fault.csv_row[1:3] == ("5", "0.6")
 
 
+def test_item_analysis_excludes_items_that_await_points() -> None:
+    text = Item("Text", 0.0, 20.0, "", True, True)
+    reports = [replace(each, items=(*each.items, text)) for each in REPORTS]
+    assert [item.title for item in analyse_items(reports)] == ["A", "B", "C"]
+
+
 def test_item_analysis_excludes_reports_pending_review() -> None:
     reports = [replace(each, instructor_action="Decide.") for each in REPORTS]
     assert analyse_items(reports) == []

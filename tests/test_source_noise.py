@@ -1,5 +1,6 @@
 """Position noise that is correlated, repeated, unequal or varying: kind and size are found."""
 
+import dataclasses
 from functools import cache, partial
 from typing import Any
 
@@ -306,3 +307,23 @@ def test_position_jump_among_outliers_is_reported_once(seed: int) -> None:
     assert evidence["count"] == 1
     assert evidence["size_m"] == pytest.approx(1.0, abs=4.0 * evidence["sigma_m"])
     assert evidence["at_s"] == pytest.approx(kept["at_s"], abs=0.2)
+
+
+def test_copy_of_ground_truth_has_no_time_correlated_noise():
+    axes = [compare(simulate_flight(Scenario(passes=2))).axes[name] for name in ("north", "east")]
+    copies = [
+        dataclasses.replace(
+            line.axis,
+            measurement_time_s=line.truth.index.to_numpy()[::10],
+            measurement_m=line.truth["position_m"].to_numpy()[::10],
+        )
+        for line in axes
+    ]
+    none, white = Unavailable("", "", ""), correlated_noise.SourceLowPass(0.0, 0.0, 0.0, 0.1)
+    truths = [line.truth for line in axes]
+    assert (
+        correlated_noise.fit_time_correlation_to_truth(
+            copies, truths, np.zeros(0), 0.0, (), none, white
+        )
+        is none
+    )

@@ -103,7 +103,8 @@ def error_above_reported_sigma(
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_REPORTED_NEES or truth.is_lag_only or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
+    horizon_nees = truth.nees_position_horizon_mean or nees  # without the output predictor's lag
+    if min(nees, horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)

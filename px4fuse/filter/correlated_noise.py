@@ -61,6 +61,8 @@ LOG_TAU_TOLERANCE = 0.05
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the noise fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
+# Minimum error (m) of a source against ground truth: a copy of the ground truth has rounding errors
+MIN_TRUTH_RESIDUAL_M = 1e-5
 # Maximum time (s) between a measurement and the nearest ground truth: error of 1 cm at 2 m/s²
 MAX_TRUTH_DISTANCE_S = 0.1
 # Number of parts of the flight with separate time offsets in the fit to ground truth
@@ -321,6 +323,8 @@ def fit_time_correlation_to_truth(
         :, nuisance_columns.shape[1] :
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
+    if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
+        return imu_fit  # the source was logged as ground truth, too
     correlated_fractions = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])

@@ -30,13 +30,24 @@ from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
+from px4fuse.trajectory.rotation import (
+    conjugate,
+    cumulative_product,
+    from_vector,
+    multiply,
+    rotate,
+    to_matrix,
+    to_vector,
+)
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+# Maximum gyro bias (rad/s) that the prior of the constants covers (5 σ); a larger bias that EKF2
+# removed from its attitude is removed here, too
+MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
 # 0.12 rad, with a linearisation error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
@@ -48,8 +59,6 @@ COARSE_OFFSET_COUNT = 25
 COARSE_MEASUREMENTS = 600
 # Maximum number of array elements per batch of time offsets, which limits memory
 SIGNALS_PER_BATCH = 2**16
-# Minimum number of time offsets that are computed together
-MIN_BATCH_OFFSETS = 3
 # Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
 # Minimum number of position measurements in a segment
@@ -69,9 +78,9 @@ MAX_IMU_INTERVAL_S = 0.025
 class Signals:
     """Motion of one segment from the IMU, and its sensitivity to constant errors.
 
-    ``table``, shape (n, 3, 3, 1 + constants), contains position, velocity and acceleration (second
-    dimension) along NED (third). The last dimension is the motion without errors, then its
-    derivative with respect to each constant. An acceleration applies until the next time.
+    ``table``, shape (n, 2, 3, 1 + constants), contains position and velocity (second dimension)
+    along NED (third). The last dimension is the motion without errors, then its derivative with
+    respect to each constant. Between two times the acceleration is constant.
     """
 
     time_s: Array
@@ -79,10 +88,11 @@ class Signals:
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Interpolate position and velocity at other times, shape (..., 3, 1 + constants)."""
-        last_index = len(self.time_s) - 1
+        last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
-        position, velocity, acceleration = np.moveaxis(self.table[row], -3, 0)
+        position, velocity = np.moveaxis(self.table[row], -3, 0)
+        acceleration = (self.table[row + 1, 1] - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -176,7 +186,7 @@ class PreparedMotion:
     def position_batches(self, offset_s: Array, *, has_scale: bool = True) -> Iterator[Positions]:
         """Yield the positions for batches of time offsets; ``has_scale``: with an unknown scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
-        batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
+        batch_size = max(1, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
             positions = self.positions(batch)
             yield centre_on_path(positions, has_scale=True) if has_scale else positions
@@ -320,6 +330,9 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
     )
     velocity_increment = integrals_at_steps[:, :3]
     rotation_vector = integrals_at_steps[:, 3:]
+    rotation_vector -= np.outer(
+        step_times_s, _large_gyro_bias(step_times_s, rotation_vector, attitude)
+    )
     attitude_quaternion = _integrate_gyros(step_times_s, rotation_vector, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
     mean_force = np.diff(velocity_increment, axis=0) / INTEGRATION_STEP_S
@@ -327,8 +340,9 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
         multiply(attitude_quaternion[:-1], from_vector(np.diff(rotation_vector, axis=0) / 2.0))
     )
     force_ned = rotate(body_to_ned, mean_force)
-    table = np.zeros((len(mean_force), 3, 3, len(CONSTANT_SIGMAS)))
-    position, velocity, acceleration = np.moveaxis(table, 1, 0)
+    table = np.zeros((len(mean_force), 2, 3, len(CONSTANT_SIGMAS)))
+    position, velocity = np.moveaxis(table, 1, 0)
+    acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
     # a rotation of the attitude by a small angle θ adds θ × f to the acceleration; a gyro bias b
@@ -346,6 +360,22 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
     mean_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
     np.cumsum(mean_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
     return Signals(step_times_s[:-1], table)
+
+
+def _large_gyro_bias(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+    """Return the gyro bias (rad/s) relative to the logged attitude; 0 if its prior σ covers it."""
+    samples = attitude.loc[step_times_s[0] : step_times_s[-1], Columns.QUATERNION]
+    if len(samples) < MIN_KEPT_MEASUREMENTS:
+        return np.zeros(3)
+    attitude_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
+    angle_at_attitude = np.column_stack(
+        [np.interp(attitude_s, step_times_s, column) for column in angle.T]
+    )
+    excess_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
+        multiply(conjugate(quaternions[:-1]), quaternions[1:])
+    )
+    bias = np.asarray(np.median(excess_rad / np.diff(attitude_s)[:, None], axis=0))
+    return bias if np.abs(bias).max() > MAX_PRIOR_GYRO_BIAS_RAD_S else np.zeros(3)
 
 
 def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:

@@ -24,6 +24,7 @@ from px4fuse.filter.fitting import (
     Noises,
     filter_positions,
     maximise_likelihood,
+    outlier_probability,
 )
 from px4fuse.filter.imu_motion import SignalCache, prepare_motion
 from px4fuse.filter.likelihood import (
@@ -33,7 +34,7 @@ from px4fuse.filter.likelihood import (
     profile_ends,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, too_few_measurements
+from px4fuse.filter.signals import Axis, independent_rows, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
@@ -204,6 +205,9 @@ def tune_axes(
     signal_cache: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
+    all_intervals = [preintegrate(axis, settings) for axis in axes]
+    all_time_s = axes[0].measurement_time_s[-len(all_intervals[0].measurement_m) :]
+    axes = tuple(axis.keep(independent_rows(axis.measurement_time_s)) for axis in axes)
     axis_intervals = [preintegrate(axis, settings) for axis in axes]
     measurement_count = len(axis_intervals[0].measurement_m)
     if measurement_count < MIN_MEASUREMENTS:
@@ -241,6 +245,9 @@ def tune_axes(
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
+    if len(all_time_s) > measurement_count:
+        all_positions = [filter_positions(interval_input) for interval_input in all_intervals]
+        is_outlier = outlier_probability(all_positions, kf_fit, len(all_time_s)) > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             f"estimate of the noises ({name})",
@@ -264,10 +271,10 @@ def tune_axes(
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
         log_likelihood_gain_per_measurement=gain_nats / measurement_count,
-        before=_assess_innovations(axis_intervals[0], chosen_noises, is_outlier),
-        after=_assess_innovations(axis_intervals[0], final_noises, is_outlier),
-        outlier_time_s=axes[0].measurement_time_s[-measurement_count:][is_outlier],
-        count=measurement_count,
+        before=_assess_innovations(all_intervals[0], chosen_noises, is_outlier),
+        after=_assess_innovations(all_intervals[0], final_noises, is_outlier),
+        outlier_time_s=all_time_s[is_outlier],
+        count=len(all_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
         held_out=_check_held_out(name, axis_intervals, chosen_noises, kf_fit),
         noises=best_fit.noises,

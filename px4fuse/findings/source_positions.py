@@ -34,6 +34,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
+    Truth,
     Unavailable,
     positions_phrase,
     reset_times_s,
@@ -350,6 +351,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
+        or isinstance(analysis.flight.truth, Truth)  # source_patterns compares with ground truth
         or not isinstance(fit, SystematicErrors)
         # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
@@ -367,7 +369,8 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
             "Measure a known distance with the source. Then check "
-            f"{source_words(analysis.source).scale}.",
+            f"{source_words(analysis.source).scale}. If the distance is right, calibrate the "
+            "accelerometers.",
             {"scale": 1.0 + scale_error, "sigma": sigma},
         )
 

@@ -23,15 +23,11 @@ class _Schema(msgspec.Struct, frozen=True):
     version: str
 
 
-class _Writer(msgspec.Struct, frozen=True):
-    px4fuse: str = "of that schema version"
-
-
 class _Head(msgspec.Struct, frozen=True):
     """Fields that results of all versions of the schema contain."""
 
     schema: _Schema
-    provenance: _Writer = _Writer()
+    provenance: Any = None
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
@@ -63,7 +59,8 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         raise ResultsError(f"{name} contains no results of px4fuse.") from error
     version, (major, minor) = head.schema.version, SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        reader_version = one_line(head.provenance.px4fuse, 60)
+        writer = head.provenance.get("px4fuse") if isinstance(head.provenance, dict) else None
+        reader_version = one_line(str(writer or "of that schema version"), 60)
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
             f"Create the report again, or read it with px4fuse {reader_version}.",

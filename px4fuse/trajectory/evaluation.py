@@ -33,6 +33,13 @@ MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference during a frozen
 # pose
 MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
+# Minimum length (m) of a jump of the estimate relative to the reference, and minimum ratio of the
+# jump to the median difference of the step lengths
+MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
+# Maximum distance (m) from the first position, or from 0, after a restart of the map
+MAX_RESTART_DISTANCE_M = 0.5
+# Maximum number of jumps whose times are stated
+MAX_STATED_JUMPS = 5
 # Minimum constant rotation (rad) between orientations of different body axes
 MIN_BODY_ROTATION_RAD = np.radians(30.0)
 # Maximum RMS deviation (rad) from the constant rotation between body axes
@@ -79,6 +86,37 @@ def find_frozen_poses(
                 f"reference moves {motion_m:.1f} m. These poses are not scored."
             )
     return is_frozen, tuple(warnings)
+
+
+def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
+    """Return a warning if matched poses of the estimate jump and those of the reference do not."""
+    step_lengths_m = [
+        np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
+        for trajectory in (estimate, reference)
+    ]
+    differences_m = np.abs(step_lengths_m[0] - step_lengths_m[1])
+    if not len(differences_m):
+        return ()
+    is_jump = (differences_m > max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))) & (
+        step_lengths_m[0] > step_lengths_m[1]
+    )
+    rows = np.flatnonzero(is_jump)
+    if not len(rows):
+        return ()
+    times_s = estimate.time_s[rows + 1] - estimate.time_s[0]
+    times_text = ", ".join(f"{time_s:.1f}" for time_s in times_s[:MAX_STATED_JUMPS])
+    starts_m = estimate.position_m[0], np.zeros(3)
+    distances_m = [
+        np.linalg.norm(estimate.position_m[rows + 1] - start_m, axis=1) for start_m in starts_m
+    ]
+    cause = "a lost track or a relocalisation"
+    if np.min(distances_m) < MAX_RESTART_DISTANCE_M:
+        cause = "a restart of the map, because it returns to its origin"
+    return (
+        f"{estimate.name} jumps by up to {differences_m[rows].max():.1f} m, {times_text} s after "
+        f"its start: probably {cause}. ATE and RPE contain the jumps. One alignment does not fit "
+        "both parts: evaluate the poses before and after a jump as separate files.",
+    )
 
 
 def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
@@ -223,6 +261,7 @@ def evaluate(
     transform, line_warnings = _fit_or_approximate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
+    jump_warnings = find_jumps(matched_estimate, matched_reference)
     aligned_estimate = matched_estimate.with_positions(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
@@ -272,11 +311,16 @@ def evaluate(
         notes=(*constant_notes[0], *constant_notes[1], *notes),
         warnings=(
             *frozen_warnings,
+            *jump_warnings,
             *line_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
             *_comparison_warnings(
-                matched_estimate, matched_reference, association_result, alignment
+                matched_estimate,
+                matched_reference,
+                association_result,
+                alignment,
+                has_jumps=bool(jump_warnings),
             ),
         ),
     )
@@ -388,7 +432,12 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
 
 
 def _comparison_warnings(
-    estimate: Trajectory, reference: Trajectory, association: Association, alignment: AlignmentKind
+    estimate: Trajectory,
+    reference: Trajectory,
+    association: Association,
+    alignment: AlignmentKind,
+    *,
+    has_jumps: bool,
 ) -> Iterator[str]:
     if association.coverage_estimate < MIN_COVERAGE:
         yield (
@@ -400,6 +449,8 @@ def _comparison_warnings(
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
+    if has_jumps:  # a jump changes the scale of the best fit
+        return
     # fit_alignment would raise an error if the motion does not determine the rotation
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
     has_motion = np.ptp(reference.position_m, axis=0).any()

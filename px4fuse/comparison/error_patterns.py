@@ -1,0 +1,383 @@
+"""Patterns in the errors of a position source: jitter, noise that grows with speed, and others.
+
+White noise and timestamp jitter are found without ground truth: each position is compared with the
+cubic through its four neighbours, which removes the motion. Slow errors are compared with ground
+truth: a fit removes a constant, a scale factor, a rotation and a time offset.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.stats import rankdata
+
+from px4fuse.comparison.model import Comparison
+from px4fuse.core.arrays import Array, cumulative_integral
+from px4fuse.filter.signals import cut_to_segment
+from px4fuse.flight.model import Columns, Unavailable
+from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
+from px4fuse.trajectory.scores import autocorrelation_time
+
+# Minimum number of positions for a pattern
+MIN_POSITIONS = 100
+# Rows of the neighbours of a position, relative to its row
+NEIGHBOURS = np.array([-2, -1, 1, 2])
+# Maximum time (median intervals) from the first to the last neighbour: lost positions and gaps
+# make the cubic inaccurate
+MAX_NEIGHBOUR_SPAN = 8.0
+# Maximum factor between the noise of a residual and that of a position
+MAX_RESIDUAL_FACTOR = 4.0
+# Number of timestamps in the running median that jitter does not shift, but a lost position does
+MEDIAN_COUNT = 9
+# Half of the time (s) over which the velocity is averaged
+HALF_VELOCITY_S = 0.3
+# Number of successive residuals that share neighbours, so that only one of them is independent
+SHARED_RESIDUALS = 3
+# Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
+MIN_JITTER_S = 0.008
+# Minimum and maximum ratio of the residuals to jitter · velocity, if jitter causes them
+JITTER_RATIOS = 0.6, 1.5
+# Minimum ratio of the errors by jitter to all white errors
+MIN_JITTER_FRACTION = 0.4
+# Minimum significance (σ) of jitter, and of noise that grows with speed
+MIN_PATTERN_SIGMAS = 6.0
+# Fractions of the positions that are slow and fast
+SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
+# Minimum ratio of the noises at high and low speed, along and across the motion
+MIN_SPEED_NOISE_RATIO = 1.6
+# Minimum extent (m, RMS) of the motion for a fit to ground truth
+MIN_PATH_RMS_M = 0.5
+# Length (s) of the running mean that is removed from the errors of odometry, which drifts
+DRIFT_WINDOW_S = 12.0
+# Length (s) of the flight parts with separate time offsets
+OFFSET_PART_S = 4.0
+# Minimum speed (m/s, RMS of a part) for a time offset of the part
+MIN_OFFSET_SPEED_M_S = 0.3
+# Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
+MIN_OFFSET_RANGE_S = 0.08
+# Minimum ratio of the mean square errors that are explained along and across the motion
+MIN_ALONG_RATIO = 4.0
+# Minimum fraction of the mean square slow error that a varying time offset explains: the constants
+# of the fit absorb a part of this error
+MIN_OFFSET_FRACTION = 0.4
+# Minimum fraction of the mean square slow error that a sinusoid explains
+MIN_PERIODIC_FRACTION = 0.88
+# Minimum amplitude of a sinusoid, in σ of the white noise
+MIN_AMPLITUDE_SIGMAS = 1.0
+# Minimum number of periods in the flight
+MIN_PERIODS = 5.0
+# Maximum tested frequency (Hz)
+MAX_FREQUENCY_HZ = 2.0
+# Maximum ratio of the sinusoid in the motion to the RMS extent of the motion
+MAX_MOTION_FRACTION = 0.1
+# Interval (s) and limit (s) of the tested delays of the logged attitude
+DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
+# Minimum delay (s) of the logged attitude that is reported
+MIN_ATTITUDE_DELAY_S = 0.04
+# Maximum number of compared rotations, which limits the time for a long flight
+MAX_ROTATIONS = 20_000
+# Interval (s) of the compared rotations
+ROTATION_STEP_S = 0.1
+# Maximum difference (rad) of rotations: larger differences are resets of the attitude
+MAX_ROTATION_RAD = 0.2
+# Maximum ratio of the mean square rotation differences with and without the delay
+MAX_DELAYED_RATIO = 0.5
+# Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
+MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
+# Ratio of the standard deviation to the median absolute value of normal noise
+SIGMA_PER_MEDIAN = 1.4826
+
+
+class SpeedNoise(NamedTuple):
+    """Position noise (1 σ, m) at low and at high speed (m/s)."""
+
+    slow_m: float
+    fast_m: float
+    slow_m_s: float
+    fast_m_s: float
+
+
+class WhiteErrors(NamedTuple):
+    """Residuals of positions against the cubic through their neighbours.
+
+    ``residual_m``, shape (n, 2), is scaled to the noise of a position. ``late_s`` is the deviation
+    of the timestamp from a constant interval, relative to the neighbours and scaled likewise.
+    """
+
+    residual_m: Array
+    velocity_m_s: Array
+    late_s: Array
+
+
+class ErrorFit(NamedTuple):
+    """Errors of a source against ground truth, explained by constants.
+
+    ``remaining_m``, shape (n, 2), is the error without constant, scale factor, rotation and time
+    offset.
+    """
+
+    time_s: Array
+    velocity_m_s: Array
+    path_m: Array
+    remaining_m: Array
+    white_m: float
+    scale: float
+    scale_sigma: float
+
+    @property
+    def slow_square_m2(self) -> float:
+        """Sum of the mean squares of both axes, without white noise."""
+        return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
+
+
+class PeriodicError(NamedTuple):
+    """Sinusoidal position error; ``fraction`` is its share of the mean square slow error."""
+
+    period_s: float
+    amplitude_m: float
+    fraction: float
+
+
+class OffsetVariation(NamedTuple):
+    """Smallest and largest time offset (s) in flight, with their times (s)."""
+
+    least_s: float
+    most_s: float
+    least_at_s: float
+    most_at_s: float
+
+
+def _rotate_90(vectors: Array) -> Array:
+    return vectors[:, ::-1] * [-1.0, 1.0]
+
+
+def _positions(comparison: Comparison) -> tuple[Array, Array]:
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
+    samples = samples[Columns.POSITION[:2]].dropna()
+    return samples.index.to_numpy(), samples.to_numpy()
+
+
+def white_errors(comparison: Comparison) -> WhiteErrors | None:
+    """Compare each position with the cubic through its neighbours; None if there are too few."""
+    time_s, position_m = _positions(comparison)
+    if len(time_s) < MIN_POSITIONS:
+        return None
+    rows = np.arange(2, len(time_s) - 2)
+    neighbour_rows = rows[:, None] + NEIGHBOURS
+    elapsed_s = time_s[neighbour_rows] - time_s[rows, None]
+    interval_s = float(np.median(np.diff(time_s)))
+    is_complete = np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_SPAN * interval_s
+    rows, neighbour_rows, elapsed_s = (
+        array[is_complete] for array in (rows, neighbour_rows, elapsed_s)
+    )
+    weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
+    for row in range(len(NEIGHBOURS)):
+        for other in set(range(len(NEIGHBOURS))) - {row}:
+            weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
+    factor = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    phase_s = time_s - interval_s * np.arange(len(time_s))
+    late_s = phase_s - median_filter(phase_s, MEDIAN_COUNT, mode="nearest")
+    half = max(2, round(HALF_VELOCITY_S / interval_s))
+    first, last = np.clip(rows - half, 0, None), np.clip(rows + half, None, len(time_s) - 1)
+    velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
+    is_accurate = factor < MAX_RESIDUAL_FACTOR
+
+    def residual(values: Array) -> Array:
+        interpolated = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
+        scaled = ((values[rows] - interpolated).T / factor).T
+        return np.asarray(scaled[is_accurate])
+
+    return WhiteErrors(residual(position_m), velocity_m_s[is_accurate], residual(late_s))
+
+
+def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
+    """Return the jitter (s, 1 σ) of the timestamps if the positions show the same jitter.
+
+    A position that is measured at a constant interval, but has a late timestamp, lies behind the
+    position of its neighbours by delay · velocity.
+    """
+    expected_m = -errors.velocity_m_s * errors.late_s[:, None]
+    expected_square_m2 = float(np.sum(expected_m**2))
+    jitter_s = float(np.std(errors.late_s))
+    if jitter_s < MIN_JITTER_S or not expected_square_m2:
+        return None
+    ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
+    rest_m = errors.residual_m - ratio * expected_m
+    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(rest_m**2) / expected_square_m2)
+    fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
+    is_jitter = (
+        JITTER_RATIOS[0] < ratio < JITTER_RATIOS[1]
+        and ratio > MIN_PATTERN_SIGMAS * sigma
+        and fraction > MIN_JITTER_FRACTION
+    )
+    return jitter_s if is_jitter else None
+
+
+def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
+    """Return the noise at low and high speed if it grows with speed in all directions."""
+    speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
+    sizes_m = np.linalg.norm(errors.residual_m, axis=1)
+    rank_correlation = np.corrcoef(rankdata(sizes_m), rankdata(speed_m_s))[0, 1]
+    if rank_correlation * np.sqrt(len(sizes_m) / SHARED_RESIDUALS) < MIN_PATTERN_SIGMAS:
+        return None
+    limits_m_s = np.quantile(speed_m_s, [SLOW_FRACTION, FAST_FRACTION])
+    is_slow, is_fast = speed_m_s <= limits_m_s[0], speed_m_s >= limits_m_s[1]
+    direction = errors.velocity_m_s / np.maximum(speed_m_s, 1e-6)[:, None]
+    along_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
+    across_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
+    # jitter of the timestamps causes errors along the motion only
+    if any(
+        np.median(part_m[is_fast]) < MIN_SPEED_NOISE_RATIO * np.median(part_m[is_slow])
+        for part_m in (along_m, across_m)
+    ):
+        return None
+    noises_m = (
+        SIGMA_PER_MEDIAN * float(np.median(np.abs(errors.residual_m[rows])))
+        for rows in (is_slow, is_fast)
+    )
+    speeds_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
+    noise = SpeedNoise(*noises_m, *speeds_m_s)
+    is_relevant = noise.fast_m_s >= MIN_FAST_M_S and noise.fast_m >= MIN_FAST_NOISE_M
+    return noise if is_relevant else None
+
+
+def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
+    """Fit a constant, scale factor, rotation and time offset to the errors against ground truth."""
+    truth = comparison.flight.truth
+    if isinstance(truth, Unavailable):
+        return None
+    time_s, position_m = _positions(comparison)
+    true_m = truth.samples[Columns.POSITION[:2]].dropna()
+    is_inside = (time_s > true_m.index[0]) & (time_s < true_m.index[-1])
+    time_s, position_m = time_s[is_inside], position_m[is_inside]
+    if len(time_s) < MIN_POSITIONS:
+        return None
+    curve = CubicSpline(true_m.index, true_m)
+    path_m, velocity_m_s = curve(time_s), curve(time_s, 1)
+    path_m = path_m - path_m.mean(axis=0)
+    path_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
+    if path_square_m2 < MIN_PATH_RMS_M**2:
+        return None
+    columns = np.stack(
+        [
+            *np.broadcast_to(np.eye(2)[:, None], (2, len(time_s), 2)),
+            path_m,
+            _rotate_90(path_m),
+            -velocity_m_s,
+        ],
+        axis=-1,
+    )
+    error_m = position_m - curve(time_s)
+    parameters, remaining_m = _least_squares(columns, error_m)
+    # successive errors are correlated
+    interval_s = float(np.median(np.diff(time_s)))
+    independent = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
+    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent))
+    if comparison.source.origin.may_drift:
+        width = max(1, round(DRIFT_WINDOW_S / interval_s))
+
+        def high_pass(values: Array) -> Array:
+            return values - uniform_filter1d(values, width, axis=0)
+
+        _, remaining_m = _least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
+    white_m = SIGMA_PER_MEDIAN * float(np.median(np.abs(white.residual_m)))
+    return ErrorFit(
+        time_s, velocity_m_s, path_m, remaining_m, white_m, float(parameters[2]), float(sigma)
+    )
+
+
+def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
+    """Return the parameters and the residuals of a fit; ``columns`` has the shape (n, 2, k)."""
+    rows = columns.reshape(-1, columns.shape[-1])
+    parameters = np.asarray(np.linalg.lstsq(rows, values.ravel(), rcond=None)[0], dtype=np.float64)
+    return parameters, values - columns @ parameters
+
+
+def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
+    """Return the sinusoid that explains most of the slow errors, unless it is in the motion."""
+    duration_s = fit.time_s[-1] - fit.time_s[0]
+    highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
+    frequencies_hz = np.arange(MIN_PERIODS / duration_s, highest_hz, 0.2 / duration_s)
+    if not len(frequencies_hz) or fit.slow_square_m2 <= 0.0:
+        return None
+
+    def mean_squares(values: Array, frequency_hz: float) -> float:
+        wave = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
+        return 2.0 * float(np.sum(np.abs(wave @ values / len(values)) ** 2))
+
+    frequency_hz = float(max(frequencies_hz, key=partial(mean_squares, fit.remaining_m)))
+    square_m2 = mean_squares(fit.remaining_m, frequency_hz)
+    motion_fraction = mean_squares(fit.path_m, frequency_hz) / np.mean(
+        np.sum(fit.path_m**2, axis=1)
+    )
+    amplitude_m, fraction = float(np.sqrt(2.0 * square_m2)), square_m2 / fit.slow_square_m2
+    if (
+        fraction < MIN_PERIODIC_FRACTION
+        or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_m
+        or motion_fraction > MAX_MOTION_FRACTION
+    ):
+        return None
+    return PeriodicError(1.0 / frequency_hz, amplitude_m, fraction)
+
+
+def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
+    """Return the range of the time offset if its variation explains the errors along the motion."""
+    parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
+
+    def regress(direction: Array) -> tuple[Array, float]:
+        """Return the offset (s) of each part, and the mean square error that they explain."""
+        products = np.bincount(parts, np.sum(fit.remaining_m * direction, axis=1))
+        squares = np.bincount(parts, np.sum(direction**2, axis=1))
+        is_moving = squares > MIN_OFFSET_SPEED_M_S**2 * np.bincount(parts)
+        offsets_s = np.where(is_moving, products / np.maximum(squares, 1e-9), np.nan)
+        explained_m2 = np.nansum(offsets_s**2 * squares) / len(parts)
+        return offsets_s, float(explained_m2)
+
+    offsets_s, along_m2 = regress(-fit.velocity_m_s)
+    _, across_m2 = regress(_rotate_90(fit.velocity_m_s))
+    times_s = fit.time_s[0] + OFFSET_PART_S * (np.arange(len(offsets_s)) + 0.5)
+    if (
+        np.isnan(offsets_s).all()
+        or np.nanmax(offsets_s) - np.nanmin(offsets_s) < MIN_OFFSET_RANGE_S
+        or along_m2 < MIN_ALONG_RATIO * across_m2
+        or along_m2 - across_m2 < MIN_OFFSET_FRACTION * fit.slow_square_m2
+    ):
+        return None
+    least, most = np.nanargmin(offsets_s), np.nanargmax(offsets_s)
+    return OffsetVariation(
+        float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
+    )
+
+
+def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
+    """Return the time (s) by which the logged attitude is late, if it is not zero."""
+    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    start_s, end_s = max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1])
+    time_s = np.arange(start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, DELAY_STEP_S)
+    time_s = time_s[:MAX_ROTATIONS]
+    step = round(ROTATION_STEP_S / DELAY_STEP_S)
+    if len(time_s) < MIN_POSITIONS:
+        return None
+    quaternions = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
+    rotation_rad = to_vector(multiply(conjugate(quaternions[:-step]), quaternions[step:]))
+    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_s)
+
+    def difference(delay_s: float) -> float:
+        angles = [np.interp(time_s - delay_s, imu_s, column) for column in angle_rad.T]
+        differences_rad = (
+            rotation_rad - (np.array(angles)[:, step:] - np.array(angles)[:, :-step]).T
+        )
+        differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
+        # resets of the attitude are larger than the rotations of a multicopter
+        sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
+        return float(np.mean(sizes_rad**2))
+
+    delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * DELAY_STEP_S)
+    delay_s = float(min(delays_s, key=difference))
+    is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and difference(
+        delay_s
+    ) < MAX_DELAYED_RATIO * difference(0.0)
+    return delay_s if is_late else None

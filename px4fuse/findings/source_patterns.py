@@ -1,0 +1,143 @@
+"""Position errors with a pattern: timestamp jitter, noise that grows with speed, and periods.
+
+With ground truth, also a time offset that varies in flight, and a scale factor error.
+"""
+
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.error_patterns import (
+    ErrorFit,
+    WhiteErrors,
+    find_attitude_delay,
+    find_offset_variation,
+    find_periodic_error,
+    find_speed_noise,
+    find_timestamp_jitter,
+    fit_errors,
+    white_errors,
+)
+from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.findings.model import (
+    Findings,
+    error,
+    finding,
+    format_percent,
+    source_words,
+    warning,
+)
+from px4fuse.findings.source_positions import (
+    MIN_SCALE_ERROR_SEVERE,
+    MIN_SCALE_ERROR_SIGMAS,
+)
+from px4fuse.flight.model import positions_phrase, source_name
+
+# Minimum scale error (ratio minus 1) against ground truth: 0.8 m in a distance of 10 m
+MIN_TRUE_SCALE_ERROR = 0.08
+# Minimum jitter (s) for severity error: a position error of 3 cm at 1 m/s
+MIN_JITTER_ERROR_S = 0.03
+# Minimum amplitude (m) of a periodic error for severity error: twice the noise of good UWB
+MIN_PERIODIC_ERROR_M = 0.2
+GRAVITY_M_S2 = 9.80665
+
+
+def detect(analysis: Analysis) -> Findings:
+    yield from detect_attitude_delay(analysis)
+    white = None if analysis.source.origin.reconstructed else white_errors(analysis)
+    if white is None:
+        return
+    yield from detect_white_patterns(analysis, white)
+    fit = fit_errors(analysis, white)
+    if fit is not None:
+        yield from detect_slow_patterns(analysis, fit)
+        if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
+            yield from detect_scale_error(analysis, fit)
+
+
+def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
+    jitter_s, clock = find_timestamp_jitter(white), analysis.source.clock_map
+    if jitter_s is not None and (clock is None or clock.distinct_stamps is None):
+        yield (error if jitter_s >= MIN_JITTER_ERROR_S else warning)(
+            "source_timestamp_jitter",
+            f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
+            f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval, "
+            "but their timestamps are not. At 1 m/s this is a position error of "
+            f"{format_metres(jitter_s)} m along the motion.",
+            "Send the time of measurement with each position, not the time at which it was "
+            "processed, sent or received.",
+            {"jitter_s": jitter_s},
+        )
+    noise = find_speed_noise(white)
+    if noise is not None:
+        yield error(
+            "source_noise_grows_with_speed",
+            f"{source_name(analysis.source)} noise grows with speed: "
+            f"{format_metres(noise.slow_m)} m at {noise.slow_m_s:.1f} m/s and "
+            f"{format_metres(noise.fast_m)} m at {noise.fast_m_s:.1f} m/s (1 σ). It grows along "
+            "and across the motion, so time offset and jitter are not the cause. No single "
+            "measurement noise fits the whole flight.",
+            "Let the source send a variance with each position that grows with speed "
+            "(EKF2_EV_NOISE_MD 0). Check motion blur, exposure and the ranging time of one "
+            "position.",
+            noise._asdict(),
+        )
+
+
+def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
+    periodic, positions = find_periodic_error(fit), positions_phrase(analysis.source)
+    if periodic is not None:
+        yield (error if periodic.amplitude_m >= MIN_PERIODIC_ERROR_M else warning)(
+            "source_error_periodic",
+            f"The error of the {positions} is periodic: amplitude "
+            f"{format_metres(periodic.amplitude_m)} m, period {periodic.period_s:.1f} s. This "
+            f"sinusoid explains {format_percent(min(periodic.fraction, 1.0))} of the slow errors "
+            "against ground truth. KF and EKF2 follow it, and innovations hardly show it.",
+            f"Check {source_words(analysis.source).errors}. Look for a process with this period, "
+            "such as multipath, a rotating part or a control loop. No noise setting corrects it.",
+            periodic._asdict(),
+        )
+        return
+    variation = find_offset_variation(fit)
+    if variation is not None:
+        yield error(
+            "source_time_offset_changes",
+            f"The time offset of the {positions} varies in flight by "
+            f"{variation.most_s - variation.least_s:.2f} s. Relative to the mean it is "
+            f"{variation.least_s:+.2f} s at {variation.least_at_s:.0f} s and "
+            f"{variation.most_s:+.2f} s at {variation.most_at_s:.0f} s, estimated from the errors "
+            "along the motion against ground truth. No single --clock-offset corrects this.",
+            "Synchronise the clocks throughout the flight, and send the time of measurement "
+            "instead of the time at which a position was sent or received.",
+            variation._asdict(),
+        )
+
+
+def detect_scale_error(analysis: Analysis, fit: ErrorFit) -> Findings:
+    if abs(fit.scale) >= max(MIN_TRUE_SCALE_ERROR, MIN_SCALE_ERROR_SIGMAS * fit.scale_sigma):
+        yield finding(
+            "error" if abs(fit.scale) >= MIN_SCALE_ERROR_SEVERE else "warning",
+            "source_scale_error",
+            f"{source_name(analysis.source)} distances are {format_percent(abs(fit.scale))} too "
+            f"{'long' if fit.scale > 0.0 else 'short'}. The comparison with ground truth is "
+            f"accurate to ± {format_percent(1.96 * fit.scale_sigma, 1)} (95 %). Innovations do not "
+            "show a scale factor error.",
+            f"Check {source_words(analysis.source).scale}.",
+            {"scale": 1.0 + fit.scale, "sigma": fit.scale_sigma},
+        )
+
+
+def detect_attitude_delay(analysis: Analysis) -> Findings:
+    imu, attitude = analysis.flight.imu, analysis.flight.attitude
+    if not isinstance(imu, pd.DataFrame) or not isinstance(attitude, pd.DataFrame):
+        return
+    delay_s = find_attitude_delay(imu, attitude)
+    if delay_s is not None:
+        yield warning(
+            "attitude_late",
+            f"The logged attitude is {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} "
+            "relative to the gyroscopes. KF rotates the acceleration by this attitude, so the "
+            f"acceleration is wrong by {format_ratio(abs(delay_s) * GRAVITY_M_S2)} m/s² for each "
+            "rad/s of roll or pitch rate.",
+            "Check the timestamps of the attitude: IMU and attitude must have the same clock.",
+            {"delay_s": delay_s},
+        )
