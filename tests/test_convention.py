@@ -381,3 +381,12 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     flight = read_log(shared("cases") / file)
     track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")
     assert_found(check_convention(flight, track), **expected)
+
+
+def test_convention_check_without_heights_keeps_horizontal_positions() -> None:
+    flight = simulate_flight(Scenario(seed=5), parse_mistakes(["no-vvo"]))
+    prepared = prepare(flight)
+    assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)
+    assert prepared.source.samples["down_m"].isna().all()
+    convention = prepared.convention
+    assert convention is None or convention.z in ("down", "up")

@@ -289,6 +289,9 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
             np.argmax(score_of_quarter, axis=0)
         ):
             unit_name, family = [*UNITS][unit_index], FAMILIES[family_index]
+            # without heights, only the third axis can be vertical
+            if family.vertical_axis != 2 and not source_motion.table[:, 2].any():
+                continue
             total_score = (
                 score_of_quarter[offset_index, family_index, unit_index]
                 + family.log_odds(quarter)

@@ -169,10 +169,8 @@ def correct_convention(
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
     to_ned = _matrix_to_ned_metres(convention, faults)
-    position_m = samples[Columns.POSITION].to_numpy() @ to_ned.T
-    variance_m2 = samples[Columns.POSITION_VARIANCE].to_numpy()
-    is_unknown = np.isnan(variance_m2).all(axis=1, keepdims=True)
-    variance_m2 = np.where(is_unknown, np.nan, np.nan_to_num(variance_m2) @ (to_ned**2).T)
+    position_m = _transform_known(samples[Columns.POSITION].to_numpy(), to_ned)
+    variance_m2 = _transform_known(samples[Columns.POSITION_VARIANCE].to_numpy(), to_ned**2)
     samples = pd.DataFrame(
         np.hstack([position_m, variance_m2]),
         _corrected_times(samples.index, faults),
@@ -212,6 +210,12 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
     return np.asarray(unit_m * rotation @ np.array(permutation))
+
+
+def _transform_known(values: Array, matrix: Array) -> Array:
+    """Multiply each row by a matrix; NaN only where an unknown value contributes."""
+    is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
+    return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
