@@ -252,10 +252,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    modelled_aids: list[str] = []
-    if is_gnss:
-        flow_labels = [FLOW.label] if len(fusion_record.flow) else []
-        modelled_aids = [GNSS_POS.label, GNSS_VEL.label, *flow_labels]
+    flow_labels = [FLOW.label] if len(fusion_record.flow) else []
+    modelled_aids = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
     if unmodelled_aids := [
         label for label in fusion_record.other_horizontal_aids if label not in modelled_aids
     ]:

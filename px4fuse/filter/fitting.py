@@ -352,7 +352,6 @@ def maximise_likelihood(
             break
         sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
         normalised_squares = expected_squares_m2 / sigma_z_variance_m2
-        had_outliers = bool(outlier_probability.any())
         previous_probability = outlier_probability
         for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
             outlier_probability = _outlier_probability(
@@ -365,7 +364,11 @@ def maximise_likelihood(
                 np.sum(outlier_probability * axis_counts), 1e-9
             )
             outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square)))
-        if outlier_probability.sum() < 1.0 and outlier_probability.max() < 0.5 and not had_outliers:
+        if (
+            outlier_probability.sum() < 1.0
+            and outlier_probability.max() < 0.5
+            and not previous_probability.any()
+        ):
             outlier_probability = previous_probability
             break
         weight = 1.0 - outlier_probability * (1.0 - outlier_width**-2.0)

@@ -7,7 +7,7 @@ and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -61,10 +61,6 @@ class Preintegrated:
     noise_fixed: Array
     measurement_m: Array
     initial: InitialState
-
-    def first_measurements(self, count: int) -> Preintegrated:
-        arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
-        return replace(self, **arrays)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:

@@ -235,17 +235,14 @@ def make_axes(
                 f"{source_label} has no position along the axis {name} in the analysed segment."
             )
         projected_acceleration = project_acceleration(acceleration, direction, segment)
-        measured_times_and_positions = (
-            track_samples.index.to_numpy()[is_finite],
-            projected[is_finite],
-        )
         axes.append(
             Axis(
                 name,
                 direction,
                 heading,
                 note,
-                *measured_times_and_positions,
+                track_samples.index.to_numpy()[is_finite],
+                projected[is_finite],
                 projected_acceleration,
             )
         )

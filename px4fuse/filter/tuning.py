@@ -208,13 +208,12 @@ def tune_axes(
     all_intervals = [preintegrate(axis, settings) for axis in axes]
     all_time_s = axes[0].measurement_time_s[-len(all_intervals[0].measurement_m) :]
     axes = tuple(axis.keep(independent_rows(axis.measurement_time_s)) for axis in axes)
-    axis_intervals = [preintegrate(axis, settings) for axis in axes]
-    measurement_count = len(axis_intervals[0].measurement_m)
+    axis_positions = [filter_positions(preintegrate(axis, settings)) for axis in axes]
+    measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
         return too_few_measurements(
             f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
         )
-    axis_positions = [filter_positions(interval_input) for interval_input in axis_intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(measurement_count))
     # fit with biases, tilt and time offset; None without IMU data
@@ -276,7 +275,7 @@ def tune_axes(
         outlier_time_s=all_time_s[is_outlier],
         count=len(all_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, axis_intervals, chosen_noises, kf_fit),
+        held_out=_check_held_out(name, chosen_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
     )
@@ -334,9 +333,7 @@ def _assess_innovations(
     return assess(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_held_out(
-    name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
-) -> HeldOutCheck | Unavailable:
+def _check_held_out(name: str, chosen_noises: Noises, fit: NoiseFit) -> HeldOutCheck | Unavailable:
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -345,22 +342,20 @@ def _check_held_out(
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    first_half = [
-        filter_positions(interval_input.first_measurements(half_count))
-        for interval_input in intervals
-    ]
+    # row 0 is KF's initial state
+    first_half = [positions.first(1 + half_count) for positions in fit.score.axis_positions]
     first_fit = maximise_likelihood(
         first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
     )
     tuned_noises = first_fit.noises
     # -ln p of the second half
-    second_half_scores = [
+    chosen_score, tuned_score = (
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
-    ]
-    second_half_count = len(fit.weight) - half_count
+    )
+    count = len(fit.weight) - half_count
     return HeldOutCheck(
         tuned_noises.sigma_a_m_s2,
         tuned_noises.sigma_z_m,
-        second_half_count,
-        (second_half_scores[0] - second_half_scores[1]) / second_half_count,
+        count,
+        (chosen_score - tuned_score) / count,
     )
