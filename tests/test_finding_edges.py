@@ -850,6 +850,17 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
 
 
+@pytest.mark.parametrize(("growth_s", "severity"), [(0.05, None), (0.2, "warning")])
+def test_growing_latency_of_positions_is_reported(growth_s: float, severity: str | None) -> None:
+    time_s = np.arange(20.0, 60.0)
+    record = ages(0, len(time_s))["record"]
+    record.vision_age_s[:] = 0.03 + growth_s * np.linspace(0.0, 1.0, len(time_s))
+    one = analysis(ekf2={"record": record})
+    findings = list(source_stamps.detect_growing_latency(one))
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    assert all("from 0.05 s to 0.21 s" in finding.message for finding in findings)
+
+
 def test_position_sample_interval_is_found_despite_jitter() -> None:
     def base(intervals: Any) -> float | None:
         found = source_intervals._find_period(np.array(intervals))
