@@ -70,7 +70,9 @@ class Ekf2Output:
             sample_us = np.rint(measured_s * 1e6).astype(np.int64)
         return sensors.timestamps(sample_us, self.time_us[steps + self.lag_steps] - sample_us)
 
-    def logged_message_indices(self, is_message: BoolArray, end_step: IntArray, rate_hz: float) -> IntArray:
+    def logged_message_indices(
+        self, is_message: BoolArray, end_step: IntArray, rate_hz: float
+    ) -> IntArray:
         """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
         events = np.flatnonzero(is_message & is_published)
@@ -102,12 +104,16 @@ def ekf2_topics(
 
 
 def _local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
-    logged_steps = np.flatnonzero(sensors.keep_at_rate(sensors.seconds(output.time_us), LOCAL_POSITION_HZ))
+    logged_steps = np.flatnonzero(
+        sensors.keep_at_rate(sensors.seconds(output.time_us), LOCAL_POSITION_HZ)
+    )
     reset_steps = np.array([step for step, _ in output.resets], dtype=np.intp)
     resets_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in output.resets)])
     reset_count = np.searchsorted(reset_steps, logged_steps, side="right")
     fields = sensors.timestamps(output.time_us[logged_steps], PUBLICATION_DELAY_US)
-    fields |= sensors.vectors({"": output.position_m[logged_steps], "v": output.velocity_m_s[logged_steps]})
+    fields |= sensors.vectors(
+        {"": output.position_m[logged_steps], "v": output.velocity_m_s[logged_steps]}
+    )
     is_step_aided = output.is_step_aided[np.maximum(logged_steps - output.lag_steps, 0)]
     fields |= {"delta_xy": resets_m[reset_count], "xy_reset_counter": reset_count % 256}
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
@@ -119,7 +125,9 @@ def _local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
 def _states_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
     """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
     end_step = model_run.events[0].end_step
-    logged_indices = output.logged_message_indices(np.diff(end_step, prepend=0) > 0, end_step, STATES_HZ)
+    logged_indices = output.logged_message_indices(
+        np.diff(end_step, prepend=0) > 0, end_step, STATES_HZ
+    )
     logged_steps = end_step[logged_indices]
     states = np.zeros((len(logged_steps), 25), np.float32)
     states[:, 0:4] = output.delayed_attitude[logged_steps]
@@ -181,7 +189,8 @@ def _position_aid_topics(
         values[logged_indices, 0, :3] for values in innovation_arrays
     )
     is_outside_gate = np.any(
-        velocity_innovation**2 > model_inputs.settings[GNSS_VEL.gate] ** 2 * velocity_innovation_variance,
+        velocity_innovation**2
+        > model_inputs.settings[GNSS_VEL.gate] ** 2 * velocity_innovation_variance,
         axis=1,
     )
     return position_topic, _aid_source_topic(
@@ -194,15 +203,15 @@ def _position_aid_topics(
     )
 
 
-def _barometer_topics(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> list[Topic]:
+def _barometer_topics(
+    model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
+) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without barometer."""
     heights, end_step = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
     updates = model_run.heights.updates(BAROMETER.name, 0, end_step.astype(float))
-    updates = updates[
-        updates["fused_at_s"] < len(output.time_us) - output.lag_steps
-    ].iloc[1:]
+    updates = updates[updates["fused_at_s"] < len(output.time_us) - output.lag_steps].iloc[1:]
     updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
     measured_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
@@ -319,5 +328,6 @@ def _flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
         "cs_mag_hdg" if model_run.segment.field is None else "cs_mag_3d": True,
     }
     return topic(
-        "estimator_status_flags", fields | ({"cs_gnss_vel": is_fusing[logged_steps]} if is_gnss else {})
+        "estimator_status_flags",
+        fields | ({"cs_gnss_vel": is_fusing[logged_steps]} if is_gnss else {}),
     )

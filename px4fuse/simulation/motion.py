@@ -167,9 +167,9 @@ def attitude(state: State) -> Attitude:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
     opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
-    specific_thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", opposite_thrust_m_s2, opposite_thrust_m_s2))[
-        :, None
-    ]
+    specific_thrust_m_s2 = np.sqrt(
+        np.einsum("ij,ij->i", opposite_thrust_m_s2, opposite_thrust_m_s2)
+    )[:, None]
     z = opposite_thrust_m_s2 / specific_thrust_m_s2
     z_rate = -state.jerk_m_s3 / specific_thrust_m_s2
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]

@@ -111,7 +111,12 @@ class Scenario:
     wander_m: float = 0.03
     uwb_rate_hz: float = bounded_number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
     sigma_uwb_m: float = bounded_number(
-        0.10, 0.0, 10.0, "m", "--sigma-uwb", "White UWB position noise (1 σ): the true measurement noise."
+        0.10,
+        0.0,
+        10.0,
+        "m",
+        "--sigma-uwb",
+        "White UWB position noise (1 σ): the true measurement noise.",
     )
     vio_rate_hz: float = 30.0
     sigma_vio_m: float = 0.01

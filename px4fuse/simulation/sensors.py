@@ -319,7 +319,11 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
         )[is_logged]
         gnss_timestamp_us = timestamp_us + round(1e6 * FIX_AGE_S)
         topic = _gnss_topic(
-            gnss_timestamp_us[is_logged], position_m[is_logged], velocity_m_s, reported_sigma, scenario
+            gnss_timestamp_us[is_logged],
+            position_m[is_logged],
+            velocity_m_s,
+            reported_sigma,
+            scenario,
         )
     else:
         body_to_ned = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
