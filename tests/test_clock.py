@@ -148,7 +148,9 @@ def test_integrated_imu_motion_equals_constant_acceleration() -> None:
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
-    np.testing.assert_array_equal(np.flatnonzero(~positions.is_joined) + 1, moved.edges[1:-1])
+    np.testing.assert_array_equal(
+        np.flatnonzero(~positions.is_joined) + 1, moved.segment_edges[1:-1]
+    )
     # positions are relative to the first measured one of each stretch
     for begin, end in positions.segments:
         known = positions.measurement_m[begin:end, 0]
@@ -158,7 +160,7 @@ def test_integrated_imu_motion_equals_constant_acceleration() -> None:
     # a third of the measurements, in every stretch
     some = moved.downsample(len(moved.time_s) // 3)
     np.testing.assert_array_equal(some.time_s, moved.time_s[::3])
-    assert len(some.edges) == 4
+    assert len(some.segment_edges) == 4
 
 
 # --- the likelihood of an offset ---

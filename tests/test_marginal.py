@@ -308,7 +308,7 @@ def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
     # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
         score = Likelihood(parts, WEIGHT, 0.1, rough)
-        assert score.is_tabulated
+        assert score.is_interpolated
         found_values = np.array([score(Noises(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]
         np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)

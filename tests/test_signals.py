@@ -355,7 +355,9 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
     assert "removed" in continuous_state(ekf2, track, WHOLE)[1]
     state, statement = continuous_state(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert statement == "EKF2 resets not removed: 1 of height (they correct an error)"
+    assert (
+        statement == "EKF2 resets not removed: 1 of height (these resets correct an error of EKF2)"
+    )
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [

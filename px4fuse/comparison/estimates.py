@@ -120,7 +120,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     )
 
 
-def tuned(
+def estimate_noises(
     comparison: PreparedComparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = ignore_progress,
@@ -159,10 +159,10 @@ def estimate_noises_and_clock(
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
-    Parameters are those of :func:`tuned`.
+    Parameters are those of :func:`estimate_noises`.
     """
     motion_cache: MotionCache = {}
-    tuning = tuned(comparison, names, progress, motion_cache)
+    tuning = estimate_noises(comparison, names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
     if slow_imu := missing_imu_rate(comparison.flight):

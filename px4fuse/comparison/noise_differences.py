@@ -20,12 +20,12 @@ MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations; ``ratio``: their σ ÷ σ in the rest of the flight."""
+    """Time span (s) with larger innovations, and their σ ÷ σ in the rest of the flight."""
 
     start_s: float
     end_s: float
-    ratio: float
-    ratio_without_outliers: float
+    sigma_ratio: float
+    sigma_ratio_without_outliers: float
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:

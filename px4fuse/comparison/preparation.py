@@ -208,8 +208,12 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
         return track
     samples = track.samples.copy()
     offset_m = [
-        float(np.nanmedian(samples[c] - np.interp(samples.index, ekf2.state.index, ekf2.state[c])))
-        for c in Columns.POSITION
+        float(
+            np.nanmedian(
+                samples[column] - np.interp(samples.index, ekf2.state.index, ekf2.state[column])
+            )
+        )
+        for column in Columns.POSITION
     ]
     if track.frame != "NED" or not np.isfinite(offset_m).all():
         return track

@@ -53,7 +53,9 @@ def continuous_state(
     statement : str
         Numbers of removed and of remaining resets, for the user; empty without a reset.
     """
-    resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
+    resets_inside = [
+        reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
+    ]
     state = ekf2.state.copy() if resets_inside else ekf2.state
     removed_resets, kept_resets = list[str](), list[str]()
     for label, quantity, columns in (
@@ -63,9 +65,9 @@ def continuous_state(
     ):
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
-            r
-            for r in resets_inside
-            if r.quantity == quantity and any(r.delta[axis] for axis in axes)
+            reset
+            for reset in resets_inside
+            if reset.quantity == quantity and any(reset.delta[axis] for axis in axes)
         ]
         if not resets:
             continue

@@ -84,13 +84,13 @@ def ml_ekf2_parameters(
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
-    used_m = noise_used_m(ekf2_inputs)
-    min_noise_m = used_m if has_slow_errors else 0.0
+    used_noise_m = noise_used_m(ekf2_inputs)
+    min_noise_m = used_noise_m if has_slow_errors else 0.0
     if (
         axis_tuning
         and noise_m
         and noise_m > min_noise_m
-        and (max(noise_m, used_m) > min_vision_noise_m)
+        and (max(noise_m, used_noise_m) > min_vision_noise_m)
     ):
         changes |= ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return changes | ml_delay_change(comparison, ekf2_inputs, clock_offset)

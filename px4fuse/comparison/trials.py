@@ -111,7 +111,7 @@ def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     return 1.0 - float(np.log(after) / np.log(before))
 
 
-def _distance(trial: Trial, statistic: Statistic) -> float:
+def _explanation_error(trial: Trial, statistic: Statistic) -> float:
     return abs(explained_fraction(trial, statistic) - 1.0)
 
 
@@ -157,19 +157,19 @@ def find_cause(
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        distance = _distance(trial, statistic)
-        is_complete = trial.corrects_sensor and distance <= SENSOR_CAUSE_TOLERANCE
+        explanation_error = _explanation_error(trial, statistic)
+        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_CAUSE_TOLERANCE
         return (
             not (is_complete or is_sufficient(trial, statistic)),
             len(trial.change.keys() - ACCOMPANYING_CHANGES),
             not trial.corrects_sensor,
-            distance,
+            explanation_error,
         )
 
     causes = (
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
-        if _distance(trial, statistic) <= CAUSE_TOLERANCE
+        if _explanation_error(trial, statistic) <= CAUSE_TOLERANCE
         and not makes_overconfident(trial, statistic)
     )
     return min(causes, key=rank, default=None)
@@ -184,9 +184,9 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
         trial
         for trial in trials
         if statistic in trial.discrepancies
-        and _distance(trial, statistic) < COMBINED_CAUSE_TOLERANCE
+        and _explanation_error(trial, statistic) < COMBINED_CAUSE_TOLERANCE
     ]
-    helpful.sort(key=lambda trial: _distance(trial, statistic))
+    helpful.sort(key=lambda trial: _explanation_error(trial, statistic))
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
@@ -200,7 +200,7 @@ def log_ratio_sum(statistics: RunStatistics) -> float:
     return sum(0.5 * abs(math.log(squared_ratio)) for squared_ratio in squared_ratios)
 
 
-def preference(trial: Trial) -> tuple[bool, int, float]:
+def preference_key(trial: Trial) -> tuple[bool, int, float]:
     """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
     is_solved = becomes_consistent(trial)
     return (
@@ -210,8 +210,8 @@ def preference(trial: Trial) -> tuple[bool, int, float]:
     )
 
 
-def ratios(statistics: RunStatistics) -> dict[Reference, float]:
-    """Return the σ ratios (actual over reported) against source and ground truth."""
+def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
+    """Return the σ sigma_ratios (actual over reported) against source and ground truth."""
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
@@ -219,14 +219,14 @@ def ratios(statistics: RunStatistics) -> dict[Reference, float]:
     return {reference: math.sqrt(mean) for reference, mean in squared_ratios.items() if mean}
 
 
-def reduction(trial: Trial) -> float:
+def log_ratio_reduction(trial: Trial) -> float:
     """Return the decrease of the sum of |ln σ ratio| (:func:`log_ratio_sum`) by a re-run."""
     return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
 
 
 def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
     """Return (reference, σ ratio before, σ ratio after the change) for source and ground truth."""
-    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
+    ratios_before, ratios_after = sigma_ratios(trial.before), sigma_ratios(trial.after)
     return [
         (reference, ratios_before[reference], ratios_after[reference])
         for reference in ratios_before.keys() & ratios_after.keys()
@@ -279,7 +279,7 @@ def find_trial(
             and (not name or name in trial.change)
             and improvement(trial) != "nothing"
         ),
-        key=preference,
+        key=preference_key,
         default=None,
     )
 

@@ -196,7 +196,7 @@ def assess(
     bias_t = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
     lag_count = min(LJUNG_BOX_LAGS, innovation_count // 5)
     autocorrelations = autocorrelation(normalised, lag_count)
-    q_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
+    ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
     return Consistency(
         **_nis_verdict_fields(normalised**2),
         innovation_mean_m=float(np.mean(nu_m)),
@@ -208,7 +208,7 @@ def assess(
         bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(autocorrelations[0]),
         ljung_box_p=float(
-            chdtrc(lag_count, innovation_count * (innovation_count + 2) * q_terms.sum())
+            chdtrc(lag_count, innovation_count * (innovation_count + 2) * ljung_box_terms.sum())
         ),
         ljung_box_lags=lag_count,
     )

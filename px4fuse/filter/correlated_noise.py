@@ -189,7 +189,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             return prepared_motion, 0.0
         # the first position of an IMU segment sets the initial state and does not contribute to the
         # likelihood
-        is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
+        is_used = np.isin(
+            time_s, np.delete(prepared_motion.time_s, prepared_motion.segment_edges[:-1])
+        )
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
     prepared_motion, _ = undo_low_pass(0.0)
@@ -326,17 +328,16 @@ def fit_time_correlation_to_truth(
     residuals = residual_basis.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
         return imu_fit  # the source was logged as ground truth, too
-    correlated_fractions = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
-    for tau_candidate_s in TRUTH_TAUS_S:
+    for tested_tau_s in TRUTH_TAUS_S:
         correlation_matrix = (
             residual_basis.T
-            @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tau_candidate_s)
+            @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
             @ residual_basis
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation_matrix)
-        relative_variance = 1.0 - correlated_fractions + correlated_fractions * eigenvalues[:, None]
+        relative_variance = 1.0 - CORRELATED_FRACTIONS + CORRELATED_FRACTIONS * eigenvalues[:, None]
         mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
         )
@@ -347,7 +348,7 @@ def fit_time_correlation_to_truth(
         grid_scores.append((scores, mean_squares.mean(axis=0)))
     # both have the shape (time constants, correlated fractions)
     scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
-    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(correlated_fractions))
+    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_FRACTIONS))
     gains_nats = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - scores.min(axis=1)
     if gains_nats.max() < min_gain_nats:
         return imu_fit
@@ -361,7 +362,7 @@ def fit_time_correlation_to_truth(
     sigmas_m = np.sqrt(
         mean_squares[tau_index, fraction_index]
         * np.array(
-            [correlated_fractions[fraction_index], 1.0 - correlated_fractions[fraction_index]]
+            [CORRELATED_FRACTIONS[fraction_index], 1.0 - CORRELATED_FRACTIONS[fraction_index]]
         )
     )
     return TimeCorrelatedNoise(
@@ -386,10 +387,8 @@ def _best_of_grid(
     """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
     scored_noises = []
     for positions in map(prepared_motion.positions_at_offset, offsets_s):
-        for noises_candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
-            noises = replace(
-                noises_candidate, sigma_a_m_s2=sigma_a_factor * noises_candidate.sigma_a_m_s2
-            )
+        for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
+            noises = replace(candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2)
             total_scores = fit_noises([positions], noises, prepared_motion.weight).scores(
                 COARSE_NOISE_FACTORS
             )[:, 0]

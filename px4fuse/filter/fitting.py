@@ -123,7 +123,7 @@ class Likelihood:
         self.axis_positions = axis_positions
         self.weight = weight
         self.sigma_z_m = sigma_z_m
-        self.is_tabulated = not any(
+        self.is_interpolated = not any(
             positions.added_process_noise.any() for positions in axis_positions
         )
         self.nodes, self.step = nodes, step = (
@@ -152,7 +152,7 @@ class Likelihood:
 
     def __call__(self, noises: Noises) -> float:
         """Return -ln p of the measurements, without a constant."""
-        if noises.random_walk_m or noises.correlated_sigma_m or not self.is_tabulated:
+        if noises.random_walk_m or noises.correlated_sigma_m or not self.is_interpolated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
@@ -220,10 +220,9 @@ def fit_noises(
             replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
             for positions in position_batches
         )
-    sigma_ratio = noises.sigma_a_m_s2 / sigma_z_m
     (fitted_positions,) = fit_ratios(
         position_batches,
-        [sigma_ratio],
+        [noises.sigma_a_m_s2 / sigma_z_m],
         noises.random_walk_m / sigma_z_m,
         measurement_weights,
         sigma_z_m,

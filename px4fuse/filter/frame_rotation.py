@@ -273,7 +273,9 @@ def _estimate_from_positions(
         )
         if isinstance(motion, Unavailable):
             return structs.replace(motion, what="heading error")
-        spans_s = motion.time_s[np.column_stack([motion.edges[:-1], motion.edges[1:] - 1])]
+        spans_s = motion.time_s[
+            np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
+        ]
         is_long = np.ptp(spans_s, axis=1) >= MIN_POSITION_PART_S
         if not is_long.any():
             return Unavailable(

@@ -112,7 +112,7 @@ class PreparedMotion:
     measurement_m : ndarray, shape (m, a)
         Positions relative to the segment's first position; NaN if missing.
     weight : ndarray, shape (m,)
-    edges : ndarray of int, shape (s + 1,)
+    segment_edges : ndarray of int, shape (s + 1,)
         Index of the first measurement of each segment; the last element is m.
     segment_motions : tuple of SegmentMotion
     directions : ndarray, shape (a, 3)
@@ -126,7 +126,7 @@ class PreparedMotion:
     time_s: Array
     measurement_m: Array
     weight: Array
-    edges: IntArray
+    segment_edges: IntArray
     segment_motions: tuple[SegmentMotion, ...]
     directions: Array
     dt_s: float
@@ -136,11 +136,11 @@ class PreparedMotion:
     def downsample(self, max_count: int) -> PreparedMotion:
         """Keep about ``max_count`` measurements; keep all if no segment would have enough."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_count)) == 0
-        kept_counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
+        kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
         has_enough_kept = kept_counts >= MIN_KEPT_MEASUREMENTS
         if not has_enough_kept.any():
             return self
-        is_kept &= np.repeat(has_enough_kept, np.diff(self.edges))
+        is_kept &= np.repeat(has_enough_kept, np.diff(self.segment_edges))
         arrays = {
             name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
         }
@@ -150,7 +150,7 @@ class PreparedMotion:
         return replace(
             self,
             **arrays,
-            edges=np.cumsum([0, *kept_counts[has_enough_kept]]),
+            segment_edges=np.cumsum([0, *kept_counts[has_enough_kept]]),
             segment_motions=segment_motions,
         )
 
@@ -159,7 +159,7 @@ class PreparedMotion:
         length_s = np.diff(self.time_s)
         unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.edges[:-1]] = START_PRECISION
+        prior_precision[self.segment_edges[:-1]] = START_PRECISION
         signal_shape = (
             len(self.directions),
             len(time_offsets_s),
@@ -168,7 +168,7 @@ class PreparedMotion:
         )
         dp, dv = np.zeros((2, *signal_shape))
         for begin, end, segment_motion in zip(
-            self.edges, self.edges[1:], self.segment_motions, strict=False
+            self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
             # both arrays have the shape (axes, time offsets, constants, times)
@@ -183,7 +183,7 @@ class PreparedMotion:
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
         return Positions(
             measurement_m=self.measurement_m,
-            segment_starts=self.edges[:-1],
+            segment_starts=self.segment_edges[:-1],
             length_s=length_s,
             unit_process_noise=unit_process_noise,
             added_process_noise=np.zeros_like(unit_process_noise),
@@ -334,8 +334,8 @@ def _covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
         return []
     gap_indices = np.flatnonzero(imu_gaps(imu_time_s))
     starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
-    ends = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
-    return list(zip(starts_s.tolist(), ends.tolist(), strict=True))
+    ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
 def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> SegmentMotion:
@@ -355,15 +355,13 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
         [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
     )
     specific_force_integral_m_s = integrals_at_steps[:, :3]
-    rotation_vector = integrals_at_steps[:, 3:]
-    rotation_vector -= np.outer(
-        step_times_s, _large_gyro_bias(step_times_s, rotation_vector, attitude)
-    )
-    attitude_quaternion = _integrate_gyros(step_times_s, rotation_vector, attitude)
+    angle_rad = integrals_at_steps[:, 3:]
+    angle_rad -= np.outer(step_times_s, _large_gyro_bias(step_times_s, angle_rad, attitude))
+    attitude_quaternion = _integrate_gyros(step_times_s, angle_rad, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_vector(np.diff(rotation_vector, axis=0) / 2.0))
+        multiply(attitude_quaternion[:-1], from_vector(np.diff(angle_rad, axis=0) / 2.0))
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
     table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(CONSTANTS_PRIOR_SIGMA)))
@@ -392,7 +390,7 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     return SegmentMotion(step_times_s[:-1], table)
 
 
-def _large_gyro_bias(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
     """Return the gyro bias (rad/s) from the logged attitude.
 
     Zero up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because the prior of the unknown constants covers it.
@@ -402,7 +400,7 @@ def _large_gyro_bias(step_times_s: Array, angle: Array, attitude: pd.DataFrame) 
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
     angle_at_attitude = np.column_stack(
-        [np.interp(attitude_time_s, step_times_s, column) for column in angle.T]
+        [np.interp(attitude_time_s, step_times_s, column) for column in angle_rad.T]
     )
     excess_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
@@ -411,10 +409,10 @@ def _large_gyro_bias(step_times_s: Array, angle: Array, attitude: pd.DataFrame) 
     return bias if np.abs(bias).max() > MAX_PRIOR_GYRO_BIAS_RAD_S else np.zeros(3)
 
 
-def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
     """Integrate the gyroscopes from the logged attitude at the start of a segment.
 
-    ``angle`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
+    ``angle_rad`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
     """
     attitude_time_s = attitude.index.to_numpy()
     near_rows = slice(
@@ -432,5 +430,5 @@ def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) 
         attitude_time_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True)
     )
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(from_vector(np.diff(angle, axis=0)))
+    rotation_since_start = cumulative_product(from_vector(np.diff(angle_rad, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

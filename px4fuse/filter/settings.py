@@ -29,9 +29,7 @@ SETTING_RANGES = {
     "sigma_a_m_s2": Range(1e-4, 100.0, "m/s²", "SIGMA_A"),
     "sigma_z_m": Range(1e-4, 100.0, "m", "SIGMA_Z"),
     "dt_s": Range(1e-3, 1.0, "s", "DT"),
-    "clock_offset_s": Range(
-        -10.0, 10.0, "s", "time offset added to the source timestamps"
-    ),
+    "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
 # Numeric settings of KF itself: the time offset belongs to the position source
 KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")

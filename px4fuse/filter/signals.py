@@ -22,9 +22,9 @@ from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Una
 
 AISLE = "aisle"
 # Minimum length (s) of a gap in the IMU
-IMU_GAP_S = 0.1
+MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
-IMU_GAP_INTERVALS = 5.0
+MIN_IMU_GAP_INTERVALS = 5.0
 # Minimum rate (Hz) of downsampled positions in estimates by likelihood: errors of a faster source
 # are time-correlated, so more positions would add computing time but no information
 MAX_INDEPENDENT_HZ = 25.0
@@ -113,7 +113,7 @@ class Axis:
 
     __repr__ = one_line_repr
 
-    def keep(self, rows: slice) -> Axis:
+    def keep_rows(self, rows: slice) -> Axis:
         """Return the axis with the measurements of the given rows only."""
         return replace(
             self,
@@ -324,8 +324,8 @@ def project_acceleration(
 
 def imu_gaps(time_s: Array) -> BoolArray:
     """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
-    interval = np.diff(time_s)
-    return interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
+    interval_s = np.diff(time_s)
+    return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
 
 
 def mean_step_acceleration(

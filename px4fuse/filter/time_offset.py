@@ -189,13 +189,13 @@ def estimate_time_offset(
         prepared_motion, offset_s, noises, sigma_s**-2.0
     )
     while True:
-        nodes_s, curve_s = (
+        node_offsets_s, curve_s = (
             _offset_grid(offset_s, half_width_s, offset_count)
             for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
         )
-        position_batches = prepared_motion.position_batches(nodes_s)
+        position_batches = prepared_motion.position_batches(node_offsets_s)
         node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
-        curve_scores = CubicSpline(nodes_s, node_scores)(curve_s)
+        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
         low_s, high_s = profile_interval(
             curve_s, curve_scores, PROFILE_DROP * offset_variance_factor
         )
@@ -323,7 +323,10 @@ def _offset_per_part(
     part_offsets = []
     score_drops = []
     for begin, end, profile in zip(
-        prepared_motion.edges, prepared_motion.edges[1:], part_profiles, strict=False
+        prepared_motion.segment_edges,
+        prepared_motion.segment_edges[1:],
+        part_profiles,
+        strict=False,
     ):
         part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
         sigma_s *= float(np.sqrt(offset_variance_factor))

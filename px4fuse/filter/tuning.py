@@ -63,7 +63,7 @@ class Noise(Record):
     high: float | None
 
     @classmethod
-    def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
+    def from_fields(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
         """Return a noise with the value and interval in the fields of :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
@@ -133,16 +133,16 @@ class AxisTuning(Record, kw_only=True):
     @property
     def sigma_a(self) -> Noise:
         """SIGMA_A of the acceleration noise alone (m/s²)."""
-        return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
+        return Noise.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
     def sigma_a_two_state(self) -> Noise:
         """SIGMA_A of KF, which has no states for biases (m/s²)."""
-        return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
+        return Noise.from_fields(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
-        return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
+        return Noise.from_fields(self.sigma_z_m, self.sigma_z_m_interval)
 
 
 def tune(
@@ -189,9 +189,10 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:  # positions far outside of the track
-                failed_analysis = f"estimate of the noises ({name})"
                 tunings[name] = Unavailable(
-                    failed_analysis, str(error), "Remove positions far from the path."
+                    f"estimate of the noises ({name})",
+                    str(error),
+                    "Remove positions far from the path.",
                 )
     return tunings
 
@@ -207,7 +208,7 @@ def tune_axes(
     """Estimate the common noises of axes with the same measurement times; see :func:`tune`."""
     kf_inputs = [preintegrate(axis, settings) for axis in axes]
     all_time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
-    axes = tuple(axis.keep(independent_rows(axis.measurement_time_s)) for axis in axes)
+    axes = tuple(axis.keep_rows(independent_rows(axis.measurement_time_s)) for axis in axes)
     axis_positions = [filter_positions(preintegrate(axis, settings)) for axis in axes]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
