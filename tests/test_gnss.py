@@ -407,7 +407,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
     found = {}
     for name in REPLAYED:
         model = model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")
-        assert model.inputs.step_s == pytest.approx(0.008, abs=1e-6)
+        assert model.inputs.mean_step_s == pytest.approx(0.008, abs=1e-6)
         found[name] = model
     return found
 

@@ -234,7 +234,7 @@ def _step_reasons(
     ekf2_parameters, aid = inputs.settings, inputs.aid
     samples_text = (
         f"KF predicts every {kf_settings.dt_s:g} s from its first position; EKF2 predicts every "
-        f"{1e3 * inputs.step_s:.0f} ms"
+        f"{1e3 * inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
         samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
@@ -255,7 +255,7 @@ def _step_reasons(
             f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
-        inputs.step_s / kf_settings.dt_s
+        inputs.mean_step_s / kf_settings.dt_s
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {

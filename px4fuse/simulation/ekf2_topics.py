@@ -230,11 +230,11 @@ def _magnetometer_topics(
     end_step = model_run.events[0].end_step
     if field is None:
         return []
-    has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
+    has_sample = np.isfinite(model_run.magnetometer_updates[:, 2, 0, 0])
     event_rows = track.logged_events(has_sample, end_step, OTHER_AIDS_HZ)
     rows = end_step[event_rows]
     innovation, innovation_variance, fused_fraction = np.moveaxis(
-        model_run.field[event_rows, :, 0], 1, 0
+        model_run.magnetometer_updates[event_rows, :, 0], 1, 0
     )
     observed_gauss = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
