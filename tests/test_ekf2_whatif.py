@@ -24,7 +24,7 @@ from px4fuse.ekf2.steps import (
     FLOW_STEP,
     GATE,
     OUTPUT,
-    STEPS,
+    REPLACEMENT_STEPS,
     VELOCITY_STEP,
     DifferenceExplanation,
     _longest_rejection,
@@ -78,7 +78,7 @@ def test_what_if_without_replay_agreement_is_unavailable(model):
 def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
-        assert tuple(step.name for step in axis.steps) == STEPS
+        assert tuple(step.name for step in axis.steps) == REPLACEMENT_STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
             unexplained = getattr(axis, f"unexplained_{quantity.removeprefix('position_')}")
             total = sum(getattr(step, quantity) for step in axis.steps) + unexplained

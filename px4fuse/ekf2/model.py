@@ -207,7 +207,7 @@ def replay_settings(
     unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
     reasons = dict.fromkeys(
         unmodelled_parameters,
-        f"the parameter does not belong to {inputs.aid.label}, which EKF2 fused",
+        f"EKF2 fused {inputs.aid.label}, to which this parameter does not apply",
     )
     height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
