@@ -257,7 +257,7 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), FAULTS)
-def test_wrong_axes_unit_or_time_offset_is_only_reported_fault(name, kind):
+def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 

@@ -23,7 +23,7 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
-from px4fuse.filter.signals import AISLE, Axis, Segment
+from px4fuse.filter.signals import Axis, Segment
 from px4fuse.flight.model import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
 
 STATE_COLUMNS = ("position_m", "velocity_m_s")
@@ -34,14 +34,9 @@ Frame = pd.DataFrame | Unavailable
 def run_kf(
     prepared: PreparedComparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
-    """Run KF along each axis (the main axis with filterpy); return the runs by axis name."""
-    names = [axis.name for axis in prepared.input_axes]
-    progress(f"running KF along the axes {', '.join(names)}")
-    main_name = AISLE if AISLE in names else names[0]
-    return {
-        axis.name: replay(axis, prepared.settings, fast=axis.name != main_name)
-        for axis in prepared.input_axes
-    }
+    """Run KF along each axis of a comparison, and return the runs by axis name."""
+    progress(f"running KF along the axes {', '.join(axis.name for axis in prepared.input_axes)}")
+    return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
 
 
 def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:

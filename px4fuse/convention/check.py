@@ -80,7 +80,7 @@ def check_convention(
 
     Returns
     -------
-    Convention, or None without IMU data or attitude.
+    Convention, or None without IMU data, attitude or enough motion at the same time.
     """
     inertial = read_inertial(flight)
     if inertial is None:
@@ -91,7 +91,7 @@ def check_convention(
     }
     hypotheses = _search_hypotheses(positions, motions)
     if not hypotheses:
-        return Convention(verdict="not determinable")
+        return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.with_clock_drift(clock_drift)
         with_drift = _search_hypotheses(positions_without_drift, motions)

@@ -38,7 +38,7 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     tilt_difference_deg: NotNegative = 0.0
 
 
-class Convention(Record, kw_only=True):
+class Convention(Record, kw_only=True, omit_defaults=False):
     """Axes, unit and clock of the positions of a source, as sent.
 
     Attributes
