@@ -19,6 +19,7 @@ from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib import pyplot
 from scipy.interpolate import CubicSpline
@@ -104,6 +105,20 @@ class Example:
     analysis: Analysis | None = None
 
 
+def find_in_changed_timestamps() -> list[Finding]:
+    """Find a late attitude, and a latency of the positions that grows in flight."""
+    flight = simulate_flight(Scenario(passes=4, seed=2))
+    age_s = pd.Series(np.linspace(0.03, 0.2, 100), index=np.linspace(5.0, 60.0, 100))
+    record = replace(flight.ekf2.record, vision_age_s=age_s)
+    flight = replace(
+        flight,
+        attitude=flight.attitude.set_axis(flight.attitude.index + 0.2),
+        ekf2=replace(flight.ekf2, record=record),
+    )
+    faults = ("attitude_late", "source_latency_grows")
+    return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
+
+
 def examples() -> dict[str, Example]:
     """Return an example of each finding, by finding id."""
     example_by_id: dict[str, Example] = {}
@@ -174,6 +189,7 @@ def examples() -> dict[str, Example]:
             "mag_heading": changed_log}  # fmt: skip
     aid_analysis = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     add_examples(find_aids(aid_analysis), "simulated innovations of the aiding sources")
+    add_examples(find_in_changed_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:
             continue

@@ -14,7 +14,7 @@ from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS
+from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE, UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, convention_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
@@ -35,7 +35,7 @@ UNIT_VECTORS = {
     "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
-ALL_AXES = [family.axes(quarter) for family in FAMILIES for quarter in range(4)]
+ALL_AXES = [assignment.axes(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU
 NED_TO = {"ENU": (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0), "NWU": (0.0, 1.0, 0.0, 0.0)}
@@ -257,7 +257,7 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), FAULTS)
-def test_wrong_axes_unit_or_time_offset_is_only_reported_fault(name, kind):
+def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 

@@ -352,7 +352,7 @@ def test_report_on_error_beyond_sigma_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_is_tested_after_alignment(
+def test_position_error_is_compared_with_sigma_after_alignment(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -531,7 +531,7 @@ def test_heading_drift_report_states_heading_at_start_and_end() -> None:
 
 @pytest.mark.parametrize("noise_is_wrong", [False, True])
 @pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
-def test_heading_error_with_wrong_gnss_noise_names_this_noise(degrees, noise_is_wrong) -> None:
+def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) -> None:
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
@@ -848,6 +848,17 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     assert finding.spans_s == ((20.0, 32.0),)
     assert source_stamps.find_synchronisation(one) == (32.0, 0.05)
     assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
+
+
+@pytest.mark.parametrize(("growth_s", "severity"), [(0.05, None), (0.2, "warning")])
+def test_growing_latency_of_positions_is_reported(growth_s: float, severity: str | None) -> None:
+    time_s = np.arange(20.0, 60.0)
+    record = ages(0, len(time_s))["record"]
+    record.vision_age_s[:] = 0.03 + growth_s * np.linspace(0.0, 1.0, len(time_s))
+    one = analysis(ekf2={"record": record})
+    findings = list(source_stamps.detect_growing_latency(one))
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    assert all("from 0.05 s to 0.21 s" in finding.message for finding in findings)
 
 
 def test_position_sample_interval_is_found_despite_jitter() -> None:

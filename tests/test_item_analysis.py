@@ -43,7 +43,7 @@ def test_item_discrimination_equals_correlation_with_other_items() -> None:
         assert item.fractions == pytest.approx(tuple(POINTS[:, index] / 10.0))
 
 
-def test_item_analysis_of_four_reports_has_no_discrimination() -> None:
+def test_item_analysis_of_four_reports_omits_discrimination() -> None:
     assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
 
 

@@ -58,11 +58,8 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of the mean square errors that are explained along and across the motion
-MIN_ALONG_RATIO = 4.0
-# Minimum fraction of the mean square slow error that a varying time offset explains: the constants
-# of the fit absorb a part of this error
-MIN_OFFSET_FRACTION = 0.4
+# Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
+MAX_REMAINING_FRACTION = 0.2
 # Minimum fraction of the mean square slow error that a sinusoid explains
 MIN_PERIODIC_FRACTION = 0.88
 # Minimum amplitude of a sinusoid, in σ of the white noise
@@ -116,12 +113,13 @@ class ErrorFit(NamedTuple):
     """Errors of a source against ground truth, explained by constants.
 
     ``remaining_m``, shape (n, 2), is the error without constant, scale factor, rotation and time
-    offset.
+    offset; ``columns``, shape (n, 2, 5), are their effects.
     """
 
     time_s: Array
     velocity_m_s: Array
     path_m: Array
+    columns: Array
     remaining_m: Array
     white_m: float
     scale: float
@@ -220,6 +218,8 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
     speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
+    if not np.ptp(sizes_m) or not np.ptp(speed_m_s):
+        return None
     rank_correlation = np.corrcoef(rankdata(sizes_m), rankdata(speed_m_s))[0, 1]
     if rank_correlation * np.sqrt(len(sizes_m) / SHARED_RESIDUALS) < MIN_PATTERN_SIGMAS:
         return None
@@ -285,7 +285,14 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
         _, remaining_m = _least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
     white_m = SIGMA_PER_MEDIAN * float(np.median(np.abs(white.residual_m)))
     return ErrorFit(
-        time_s, velocity_m_s, path_m, remaining_m, white_m, float(parameters[2]), float(sigma)
+        time_s,
+        velocity_m_s,
+        path_m,
+        columns,
+        remaining_m,
+        white_m,
+        float(parameters[2]),
+        float(sigma),
     )
 
 
@@ -324,29 +331,33 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
 
 
 def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
-    """Return the range of the time offset if its variation explains the errors along the motion."""
+    """Return the range of the time offset if its variation explains the slow errors.
+
+    The time offsets of all flight parts and the constants of :class:`ErrorFit` are fitted together.
+    At rest a time offset causes no error, so jumps and slow errors are not explained.
+    """
     parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-
-    def regress(direction: Array) -> tuple[Array, float]:
-        """Return the offset (s) of each part, and the mean square error that they explain."""
-        products = np.bincount(parts, np.sum(fit.remaining_m * direction, axis=1))
-        squares = np.bincount(parts, np.sum(direction**2, axis=1))
-        is_moving = squares > MIN_OFFSET_SPEED_M_S**2 * np.bincount(parts)
-        offsets_s = np.where(is_moving, products / np.maximum(squares, 1e-9), np.nan)
-        explained_m2 = np.nansum(offsets_s**2 * squares) / len(parts)
-        return offsets_s, float(explained_m2)
-
-    offsets_s, along_m2 = regress(-fit.velocity_m_s)
-    _, across_m2 = regress(_rotate_90(fit.velocity_m_s))
-    times_s = fit.time_s[0] + OFFSET_PART_S * (np.arange(len(offsets_s)) + 0.5)
+    square_speeds = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1)) / np.bincount(parts)
+    moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
+    if len(moving_parts) < 2:
+        return None
+    is_in_part = parts[:, None] == moving_parts
+    offset_columns = -fit.velocity_m_s[:, :, None] * is_in_part[:, None, :]
+    constant_columns = fit.columns[..., :-1]  # without the constant time offset
+    parameters, remaining_m = _least_squares(
+        np.concatenate([constant_columns, offset_columns], axis=-1),
+        fit.remaining_m,
+    )
+    offsets_s = parameters[constant_columns.shape[-1] :]
+    remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
-        np.isnan(offsets_s).all()
-        or np.nanmax(offsets_s) - np.nanmin(offsets_s) < MIN_OFFSET_RANGE_S
-        or along_m2 < MIN_ALONG_RATIO * across_m2
-        or along_m2 - across_m2 < MIN_OFFSET_FRACTION * fit.slow_square_m2
+        np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
+        or fit.slow_square_m2 <= 0.0
+        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
     ):
         return None
-    least, most = np.nanargmin(offsets_s), np.nanargmax(offsets_s)
+    times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
+    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
     return OffsetVariation(
         float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
     )

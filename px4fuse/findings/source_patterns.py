@@ -18,6 +18,7 @@ from px4fuse.comparison.error_patterns import (
     white_errors,
 )
 from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -97,7 +98,9 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
             periodic._asdict(),
         )
         return
-    variation = find_offset_variation(fit)
+    clock, variation = analysis.clock, find_offset_variation(fit)
+    if isinstance(clock, ClockOffset) and clock.changes:
+        return  # source_clock reports the change
     if variation is not None:
         yield error(
             "source_time_offset_changes",

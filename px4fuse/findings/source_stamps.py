@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from scipy.stats import spearmanr
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array
@@ -26,6 +27,8 @@ MAX_ARRIVAL_AGE_S = 0.001
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
+# Minimum rank correlation of latency and time, if the latency grows in flight
+MIN_LATENCY_TREND = 0.8
 # Minimum number of positions before, and also after, the convergence of TIMESYNC
 MIN_SAMPLES = 10
 # Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
@@ -45,6 +48,7 @@ def detect(analysis: Analysis) -> Findings:
     clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
+        yield from detect_growing_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
     elif clock.clock in STAMP_FAULTS:
@@ -174,6 +178,33 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             ANSWER_TIMESYNC,
             {"until_s": float(position_age_s.index[-1])},
         )
+
+
+def detect_growing_latency(analysis: Analysis) -> Findings:
+    """Detect positions that arrive later and later after their measurement."""
+    position_age_s = _position_age_s(analysis)
+    if position_age_s is None or find_synchronisation(analysis) is not None:
+        return
+    part_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    start_s, end_s = (
+        float(part.median())
+        for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
+    )
+    trend = spearmanr(position_age_s.index, position_age_s).statistic
+    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
+        return
+    ekf2, buffer_sentence, make_finding = analysis.flight.ekf2, "", warning
+    if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
+        buffer_sentence = f" EKF2 fuses only positions younger than {ekf2.horizon_s:.2f} s."
+        make_finding = error if end_s > ekf2.horizon_s else warning
+    yield make_finding(
+        "source_latency_grows",
+        f"The latency of the {positions_phrase(analysis.source)} grows in flight from "
+        f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{buffer_sentence}",
+        "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
+        "let the sender drop old positions.",
+        {"start_s": start_s, "end_s": end_s},
+    )
 
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:

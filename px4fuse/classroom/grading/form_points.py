@@ -364,7 +364,7 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _choices_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the mean score of the figure questions; a wrong answer is negative, so guesses give 0."""
+    """Return the mean score of the figure questions, where guesses give 0 on average."""
     wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
     right_letters = (right_letter for _, right_letter in truth.choices)
     points = (
