@@ -205,7 +205,7 @@ def _format_value(value: str | float) -> str:
 
 def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the label and the options of each drop-down list, most frequent option first."""
-    counts = Counter(tag for log in logs for tag in log["tags"])
+    count_by_tag = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
@@ -213,7 +213,7 @@ def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, s
     for kind, label in SELECTION_LABELS.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
-            for tag, count in counts.most_common()
+            for tag, count in count_by_tag.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
@@ -267,13 +267,13 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
 
 
 def _log_tags(log: LogSummary) -> dict[str, str]:
-    tags = {
+    label_by_tag = {
         f"severity:{log['severity']}": log["severity"],
         f"status:{log['status']}": log["status"],
     }
     for name in ("vehicle", "firmware"):
-        tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
-    tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return tags | {
+        label_by_tag[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
+    label_by_tag |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
+    return label_by_tag | {
         f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
     }

@@ -53,14 +53,14 @@ class BatchResult:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     reused_count : int
         Number of logs whose results are from an earlier run.
-    written : tuple of Path
+    written_paths : tuple of Path
         Files of the table.
     """
 
     table: pd.DataFrame
     reused_count: int
     severities: frozenset[str]
-    written: tuple[Path, ...]
+    written_paths: tuple[Path, ...]
 
 
 class CachedRows(msgspec.Struct, frozen=True):
@@ -73,7 +73,7 @@ class CachedRows(msgspec.Struct, frozen=True):
     rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
 
     @property
-    def file(self) -> str:
+    def relative_path(self) -> str:
         return f"rows/{self.sha256}.json"
 
 
@@ -220,8 +220,8 @@ def run(
                 if state.hash_by_address or state.failed_row_by_address:
                     batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            note = RESUME_NOTE if (output / "rows").is_dir() else ""
-            raise type(error)(f"{error} {note}".rstrip()) from error
+            resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
+            raise type(error)(f"{error} {resume_note}".rstrip()) from error
     return batch_result
 
 
@@ -230,8 +230,10 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):
         first_row = cached_rows.rows[0]
-        columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
-        if all((state.output / first_row.get(column, "")).is_file() for column in columns):
+        required_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
+        if all(
+            (state.output / first_row.get(column, "")).is_file() for column in required_file_columns
+        ):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
@@ -276,7 +278,7 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
     }
     rows = [clean_row(row) | path_by_column for row in outcome.rows]
     cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
-    contents = content_by_name | {cached_rows.file: msgspec.json.encode(cached_rows)}
+    contents = content_by_name | {cached_rows.relative_path: msgspec.json.encode(cached_rows)}
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 

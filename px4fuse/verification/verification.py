@@ -208,11 +208,13 @@ def _repeat_loop(
     return analysis, loop_results(recorded_request, analysis, submitted_results.student)
 
 
-def _draw_report(analysis: object, results: ReportedResults, versions: Provenance) -> bytes:
+def _draw_report(
+    analysis: object, results: ReportedResults, submitted_provenance: Provenance
+) -> bytes:
     """Draw the report with the library versions that the submitted report states."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
-    new_provenance = replace(versions, command=results.provenance.command)
+    new_provenance = replace(submitted_provenance, command=results.provenance.command)
     return render(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
@@ -345,18 +347,18 @@ def _verify_with_log(
 
 
 def is_same_number_rounded(
-    pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
+    agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
     """Return True if two printed numbers are roundings of results that agree.
 
-    ``pairs`` are recorded and recomputed results that are equal within the tolerances.
+    ``agreeing_pairs`` are recorded and recomputed results that are equal within the tolerances.
     """
     decimals = _decimal_count(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
     return decimals == _decimal_count(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
-        for a, b in pairs
+        for a, b in agreeing_pairs
     )
 
 
