@@ -151,10 +151,10 @@ def _check_memory() -> None:
         import resource
     except ImportError:  # Windows has no memory limit for a process
         return
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
+    limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
         raise SettingsError(
-            f"the memory limit is {limit / 1e6:.0f} MB; px4fuse needs at least "
+            f"the memory limit is {limit_bytes / 1e6:.0f} MB; px4fuse needs at least "
             f"{MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space",
             "Raise the memory limit, for example with ulimit -v unlimited.",
         )

@@ -248,8 +248,7 @@ def request_option(
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
-        range_text = "{:g} to {:g} {}".format(*SETTING_RANGES[name])
-        help_text = help_text.replace("RANGE", range_text)
+        help_text = help_text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
     # for a position file, click derives the parameter name from the option (position_frame)
     names = () if request_type is PositionFile else (name,)
     return click.option(OPTION_NAMES[request_type][name], *names, help=help_text, **details)
@@ -380,7 +379,6 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """Yield the options and arguments that the user typed."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
