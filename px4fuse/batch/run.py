@@ -142,7 +142,7 @@ def run_batch(
         batch_result = run(
             map(str, sources), folder, reports=reports and output is not None, **settings
         )
-    # the results in a temporary folder are deleted
+    # without an output folder, the files were temporary
     missing_files = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
     return batch_result.table.assign(**missing_files)
 

@@ -63,7 +63,7 @@ PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
-    """Group of click that imports a command only when the command is called."""
+    """Group of commands of click, each imported when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -206,7 +206,7 @@ def _prepare_libraries() -> None:
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
-        # pandas then assumes that pyarrow is not installed
+        # with None, pandas assumes that pyarrow is not installed
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 

@@ -50,7 +50,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "alignment",
-    "Transform of the estimate that is fitted to the reference before errors are computed.  "
+    "Transform that aligns the estimate with the reference before errors are computed.  "
     "[default: yaw for VIO, EKF2 and KF; se3 for SLAM; sim3 for monocular SLAM]",
 )
 @_evaluation_option(

@@ -25,7 +25,7 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Name of the argument of a tool, by the name of the command's parameter if the names differ
+# Names of tool arguments that differ from the name of the command's parameter
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
 # Parameters of commands that tools do not have: outputs, exit codes and student
 HIDDEN_PARAMETERS = {

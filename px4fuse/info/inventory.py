@@ -100,12 +100,10 @@ class Source:
         Kind of data: a value of :data:`DATA_LABELS`.
     name : str
         Name of a position track, or else of the first topic.
-    log : str
-        Name of the file.
     samples : int or None
         Number of samples; None for the land detector.
     start_s, end_s : float or None
-        Times of the first and last sample, in seconds after the first data.
+        Times of the first and last sample, after the first data.
     chosen : bool
         True for the position source that ``px4fuse compare`` uses by default.
     unavailable : str
