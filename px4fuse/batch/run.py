@@ -82,7 +82,7 @@ class _RunState:
     """State of a run of ``px4fuse batch``: settings, and the logs that are finished so far."""
 
     output: Path
-    px4fuse: str
+    version: str
     settings: str
     # SHA-256 of logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
@@ -245,7 +245,7 @@ def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
-        if (cached_rows.px4fuse, cached_rows.settings) == (state.px4fuse, state.settings):
+        if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings):
             yield cached_rows
 
 
@@ -277,7 +277,7 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
         for column, name in zip(OUTPUT_FILE_COLUMNS, content_by_name, strict=True)
     }
     rows = [clean_row(row) | path_by_column for row in outcome.rows]
-    cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
+    cached_rows = CachedRows(outcome.sha256, state.version, state.settings, log.size_bytes, rows)
     contents = content_by_name | {cached_rows.relative_path: msgspec.json.encode(cached_rows)}
     write_all({state.output / name: content for name, content in contents.items() if content})
 
@@ -307,13 +307,13 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     def rows() -> Iterator[Row]:
         for log in logs:
             common_columns = {"log": log.table_path, "name": log.name}
-            common_columns |= {"px4fuse": state.px4fuse, "settings": state.settings}
+            common_columns |= {"px4fuse": state.version, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
                 yield with_log_path(row, log.table_path) | common_columns
 
     table = make_table(rows())
-    page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
+    page = html_text(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": csv_bytes(table),

@@ -107,8 +107,8 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
-def default_report(name: str, results: Results) -> Path:
-    """Return the default path of a report; a long name is cut.
+def default_report_path(name: str, results: Results) -> Path:
+    """Return the path of a report without -o; a long name is cut.
 
     Raises
     ------
@@ -178,8 +178,8 @@ def _student_name_and_id(results: Results) -> tuple[str, str]:
     return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
-def web_page(output: Path | None, default: Path) -> Path:
-    """Return the path of the web page to write: the value of -o, else the default path.
+def web_page_path(output: Path | None, default: Path) -> Path:
+    """Return the value of -o, or else the default path, and check the path.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     if default_name and output is None and json_path is None:
-        output = default_report(default_name, results)
+        output = default_report_path(default_name, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
