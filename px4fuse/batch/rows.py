@@ -79,14 +79,14 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
     A finding that is the effect of another finding is omitted.
     """
-    causes = [finding for finding in findings if finding.caused_by is None]
+    cause_findings = [finding for finding in findings if finding.caused_by is None]
     aid_verdicts = [
         f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"
     ]
     return {
         "aids": FINDING_SEPARATOR.join(aid_verdicts),
-        "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
-        "severities": sorted({finding.severity for finding in causes}),
+        "findings": FINDING_SEPARATOR.join(finding.id for finding in cause_findings),
+        "severities": sorted({finding.severity for finding in cause_findings}),
     }
 
 

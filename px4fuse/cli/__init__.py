@@ -126,23 +126,23 @@ def cli() -> None:
     """
 
 
-def _make_system_error(error: MemoryError | OSError, written_text: str) -> Px4FuseError:
+def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4FuseError:
     if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return Px4FuseError(
-            f"not enough memory; {written_text}",
+            f"not enough memory; {files_sentence}",
             "Close other programs, or raise the limit (ulimit -v).",
         )
     try:
         Path.cwd()
     except OSError:
         return SettingsError(
-            f"the current folder no longer exists; {written_text}", "Change to another folder."
+            f"the current folder no longer exists; {files_sentence}", "Change to another folder."
         )
     if error.filename is not None:
         return OutputError(
-            f"The file {error.filename} cannot be used ({error.strerror}); {written_text}"
+            f"The file {error.filename} cannot be used ({error.strerror}); {files_sentence}"
         )
-    return OutputError(f"standard output cannot be written ({error.strerror}); {written_text}")
+    return OutputError(f"standard output cannot be written ({error.strerror}); {files_sentence}")
 
 
 def _check_memory() -> None:

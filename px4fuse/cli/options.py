@@ -239,19 +239,21 @@ def request_option(
     """
     field = next(field for field in structs.fields(request_type) if field.name == name)
     types = (field.type, *get_args(field.type))
-    literals = [each for each in types if get_origin(each) is Literal]
+    literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
         unit = next(unit for suffix, unit in SUFFIX_UNITS.items() if name.endswith(suffix))
-        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literals))
-    elif literals:
-        details["type"] = Choice(get_args(literals[0]))
+        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literal_types))
+    elif literal_types:
+        details["type"] = Choice(get_args(literal_types[0]))
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
         help_text = help_text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
     # for a position file, click derives the parameter name from the option (position_frame)
-    names = () if request_type is PositionFile else (name,)
-    return click.option(OPTION_NAMES[request_type][name], *names, help=help_text, **details)
+    parameter_names = () if request_type is PositionFile else (name,)
+    return click.option(
+        OPTION_NAMES[request_type][name], *parameter_names, help=help_text, **details
+    )
 
 
 _comparison_option = partial(request_option, ComparisonRequest)

@@ -348,9 +348,11 @@ def _analyses_against_ekf2_and_truth(
         )
     for name, data in data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
-        count = f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+        count_text = (
+            f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+        )
         yield _make_analysis_option(
-            name, NO_COMPARISON if comparison is None and has_data else data, count
+            name, NO_COMPARISON if comparison is None and has_data else data, count_text
         )
 
 

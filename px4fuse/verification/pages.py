@@ -370,8 +370,8 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
     """Return references to the pages of a page tree with one level, as px4fuse writes it."""
-    tree: Any = reader.root_object["/Pages"]
-    return [*list.__iter__(tree["/Kids"])]
+    page_tree: Any = reader.root_object["/Pages"]
+    return [*list.__iter__(page_tree["/Kids"])]
 
 
 def _pdf_type_of(value: Any) -> type:
@@ -394,13 +394,13 @@ def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
-def _xmp_metadata(data: bytes) -> str:
+def _xmp_metadata(xmp_bytes: bytes) -> str:
     """Return XMP metadata in canonical form, without fields that other programs change."""
     # an XML document type ("<!") may contain entities that expand to huge texts
-    if len(data) > MAX_XMP_BYTES or b"<!" in data:
-        return data.decode("latin-1")
-    packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
-    canonical_text = ElementTree.canonicalize(packet.strip(), strip_text=True)
+    if len(xmp_bytes) > MAX_XMP_BYTES or b"<!" in xmp_bytes:
+        return xmp_bytes.decode("latin-1")
+    xmp_text = re.sub(r"<\?.*?\?>", "", xmp_bytes.decode("utf-8", "replace"))
+    canonical_text = ElementTree.canonicalize(xmp_text.strip(), strip_text=True)
     return _TYPST_VERSION_PATTERN.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
 
 

@@ -184,8 +184,8 @@ def _repeat_comparison(
         log=link_file(recorded_request.log, submitted_results.log.sha256, "the log"),
     )
     if (position := recorded_request.position) is not None:
-        link = link_file(position.path, hash_by_role.get("position"), "--position")
-        request = replace(request, position=replace(position, path=link))
+        linked_path = link_file(position.path, hash_by_role.get("position"), "--position")
+        request = replace(request, position=replace(position, path=linked_path))
     analysis = diagnose(request)
     return analysis, results(recorded_request, analysis, submitted_results.student)
 
@@ -198,8 +198,8 @@ def _repeat_loop(
 
     recorded_request = submitted_results.request
     path, track = split_track(recorded_request.source)
-    link = link_file(path, submitted_results.track.sha256, "the log")
-    request = replace(recorded_request, source=link + track)
+    linked_path = link_file(path, submitted_results.track.sha256, "the log")
+    request = replace(recorded_request, source=linked_path + track)
     if recorded_request.reference is not None:
         path, track = split_track(recorded_request.reference)
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
@@ -301,23 +301,23 @@ def _verify_with_log(
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
     page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)
     is_from_other_program = any(difference.is_structural for difference in page_differences)
-    own_versions = new_results.provenance.libraries.items()
-    other_versions = (
-        {*submitted_results.provenance.libraries.items()} - {*own_versions}
+    installed_libraries = new_results.provenance.libraries.items()
+    differing_libraries = (
+        {*submitted_results.provenance.libraries.items()} - {*installed_libraries}
         if page_differences
         else ()
     )
     # pages from another program or from other library versions may differ without a forgery
-    is_comparable = not (is_from_other_program or other_versions)
+    is_comparable = not (is_from_other_program or differing_libraries)
     page_status: PageStatus = "same"
     if page_differences:
         page_status = "differ" if is_comparable else "not compared"
     status: Status = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
-    sentences = [difference.sentence for difference in page_differences]
-    page_sentences = sentences[:MAX_LISTED_PAGE_DIFFERENCES]
-    if unlisted_count := len(sentences) - len(page_sentences):
+    difference_sentences = [difference.sentence for difference in page_differences]
+    page_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
+    if unlisted_count := len(difference_sentences) - len(page_sentences):
         page_sentences.append(f"the PDF has {unlisted_count} more differences")
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":
@@ -325,8 +325,8 @@ def _verify_with_log(
     else:
         reasons += page_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
-    if other_versions:  # other library versions may draw other pages
-        versions_text = one_line(", ".join(map(" ".join, sorted(other_versions))), 300)
+    if differing_libraries:  # other library versions may draw other pages
+        versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions"
         )
