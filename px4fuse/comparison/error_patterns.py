@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, cumulative_integral
@@ -44,6 +44,9 @@ JITTER_RATIOS = 0.6, 1.5
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
+# Number of flight parts in which the growth with speed is tested, and its minimum median
+# significance (σ)
+PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
 # Fractions of the positions that are slow and fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
 # Minimum ratio of the noises at high and low speed, along and across the motion
@@ -155,6 +158,7 @@ def _rotate_90(vectors: Array) -> Array:
 def _positions(comparison: Comparison) -> tuple[Array, Array]:
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     samples = samples[Columns.POSITION[:2]].dropna()
+    samples = samples[~(samples.diff() == 0.0).all(axis=1)]  # without repeated positions
     return samples.index.to_numpy(), samples.to_numpy()
 
 
@@ -218,10 +222,17 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
     speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
-    if not np.ptp(sizes_m) or not np.ptp(speed_m_s):
-        return None
-    rank_correlation = np.corrcoef(rankdata(sizes_m), rankdata(speed_m_s))[0, 1]
-    if rank_correlation * np.sqrt(len(sizes_m) / SHARED_RESIDUALS) < MIN_PATTERN_SIGMAS:
+    # noise that is larger in one part of the flight correlates with speed in a few parts only
+    significances = [
+        spearmanr(sizes_m[part], speed_m_s[part]).statistic * np.sqrt(len(part) / SHARED_RESIDUALS)
+        for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
+        if np.ptp(sizes_m[part]) and np.ptp(speed_m_s[part])
+    ]
+    if (
+        len(significances) <= PART_COUNT
+        or significances[0] < MIN_PATTERN_SIGMAS
+        or np.median(significances[1:]) < MIN_PART_SIGMAS
+    ):
         return None
     limits_m_s = np.quantile(speed_m_s, [SLOW_FRACTION, FAST_FRACTION])
     is_slow, is_fast = speed_m_s <= limits_m_s[0], speed_m_s >= limits_m_s[1]
