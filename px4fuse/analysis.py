@@ -1,4 +1,4 @@
-"""Records of an analysis: :mod:`px4fuse.diagnose` computes them from a request."""
+"""Records with the results of an analysis, computed by :mod:`px4fuse.diagnose`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ from px4fuse.request import ComparisonRequest
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison, Estimates, Reruns):
-    """Comparison of KF and EKF2, with estimates, re-runs and findings.
+    """Comparison of KF and EKF2, with parameter estimates, re-runs of both filters and faults.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Analysis(Comparison, Estimates, Reruns):
     loop : Loop or Unavailable
         Loop closure error of the flight's odometry, and corrected paths.
     findings : tuple of Finding
-        Findings about the flight, most severe first, each cause followed by its effects.
+        Faults of the flight, most severe first, each cause followed by its effects.
     request : ComparisonRequest or None
     """
 
@@ -51,26 +51,26 @@ class Analysis(Comparison, Estimates, Reruns):
 
     @property
     def main_trials(self) -> list[Trial]:
-        """Re-runs along the main axis, without an EKF2 replay that differs from the log."""
+        """Re-runs along the main axis, except EKF2 re-runs that are not compared with the log."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
     @property
     def secondary_axes(self) -> list[AxisComparison]:
-        """Comparisons along all axes except the main axis."""
+        """Comparisons along all axes except ``main``, the axis with the largest motion."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 
 @dataclass(frozen=True)
 class AidsOnlyAnalysis:
-    """Evaluation of EKF2's aiding sources in a flight without positions for KF.
+    """Evaluation of EKF2's aiding sources in a flight without positions for the filter KF.
 
     Attributes
     ----------
     flight : Flight
     aids : mapping from PX4's name to AidResult
     missing_data : Unavailable
-        Reason why KF cannot be run, and the action.
+        Reason why KF cannot be run, and advice for logging positions.
     findings : tuple of Finding
         Faults of the aiding sources.
     """
@@ -85,18 +85,18 @@ class AidsOnlyAnalysis:
 
 @dataclass(frozen=True)
 class WhatIfAnalysis:
-    """Replays of EKF2 with changed parameters or without aiding sources.
+    """Replays of EKF2 with changed parameters, or with aiding sources switched off.
 
     Attributes
     ----------
     changes : mapping from PX4 name to value
-        Changed parameters; empty if only a sweep is requested.
+        Changed parameters of EKF2; empty if the user requested only a sweep of one parameter.
     uses_estimates : bool
         True if the changes are the maximum-likelihood estimates.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Explanation of the difference between KF (default settings) and EKF2 as flown.
+        Causes of the difference between KF (default settings) and EKF2 as flown.
     without : mapping from PX4's name of an aiding source to float
-        Time (s) from which EKF2 does not fuse the aiding source.
+        Aiding sources switched off in the replays, each with the time (s) of switching off.
     """
 
     flight: Flight
@@ -110,12 +110,12 @@ class WhatIfAnalysis:
 
     @property
     def sweep_start_index(self) -> int:
-        """Index of the first replay of the sweep in ``whatif.whatif``."""
+        """Number of replays before the sweep: 1 with ``changes`` or ``without``, else 0."""
         return int(bool(self.changes or self.without))
 
 
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """Return the verdicts of failed EKF2 checks (``--checks``), by axis or aiding source.
+    """Return the consistency verdicts of failed EKF2 checks, by axis or aiding source.
 
     A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
     biased or not fused for too long.

@@ -28,8 +28,8 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table(); they contain floats, except for "count" and "verdict"
-COLUMNS = (
+# Columns of table(): floats, except for "count" and "verdict"
+SUMMARY_COLUMNS = (
     "count",
     "nis_mean",
     "nis_low",
@@ -83,7 +83,7 @@ def compare(
     start_s, end_s : float, optional
         Analysed time span, in seconds after the first data; default: take-off and landing.
     position_source : str, optional
-        Name of the position track for KF; default: the track with the fewest processing steps.
+        Name of the position track for KF; default: the track closest to the raw measurement.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
         Kind of the position source; default: from its messages.
     height : {"gnss", "barometer"}, optional
@@ -106,7 +106,7 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    arguments = locals()  # names of the arguments are fields of the request
+    arguments = locals()  # by the names of the fields of ComparisonRequest
     known_axes = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown_axes := set(axis_names).difference(known_axes):
@@ -145,15 +145,15 @@ def table(analysis: Analysis) -> pd.DataFrame:
         for filter_name, summary in axis.filters.items()
     }
     index = pd.MultiIndex.from_tuples(rows, names=["axis", "filter"])
-    types = dict.fromkeys(COLUMNS, "float64") | {"count": "Int64", "verdict": "object"}
-    return pd.DataFrame(list(rows.values()), index, COLUMNS).astype(types)
+    types = dict.fromkeys(SUMMARY_COLUMNS, "float64") | {"count": "Int64", "verdict": "object"}
+    return pd.DataFrame(list(rows.values()), index, SUMMARY_COLUMNS).astype(types)
 
 
 def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
     truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
-    numbers = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
-    numbers["nis_low"], numbers["nis_high"] = numbers.get("nis_band", (None, None))
-    return numbers
+    row = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
+    row["nis_low"], row["nis_high"] = row.get("nis_band", (None, None))
+    return row
 
 
 def evaluate(
@@ -259,9 +259,9 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
 
     target = _require_suffix(path, ".pdf")
     contract_results = results(_require_request(analysis), analysis)
-    text = to_json(contract_results)
-    pdf = render(analysis, contract_results, text)
-    write_all({target: pdf, target.with_suffix(".json"): text.encode()})
+    results_json = to_json(contract_results)
+    pdf = render(analysis, contract_results, results_json)
+    write_all({target: pdf, target.with_suffix(".json"): results_json.encode()})
     return target
 
 
@@ -302,7 +302,7 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "This analysis was not made by px4fuse.compare, so its command is unknown.",
+            "This analysis was not made by px4fuse.compare, so the command to print is unknown.",
             "Make the analysis with px4fuse.compare.",
         )
     return analysis.request
@@ -322,8 +322,8 @@ def what_if(
     changes : mapping or sequence of mappings, optional
         Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: the
         maximum-likelihood estimates of noise and delay of the position source.
-    without : mapping from PX4's name of an aiding source to float, optional
-        Time (s) from which EKF2 does not fuse the aiding source, as ``{"gnss_pos": 60.0}``.
+    without : mapping of str to float, optional
+        Time (s) from which EKF2 does not fuse an aiding source, such as ``{"gnss_pos": 60.0}``.
 
     Raises
     ------
@@ -334,7 +334,7 @@ def what_if(
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
-    model = require_available(open_model(flight), flight)
+    ekf2_model = require_available(open_model(flight), flight)
     changes = {} if changes is None else changes
-    settings = [changes] if isinstance(changes, Mapping) else changes
-    return require_available(whatif.what_if(model, settings, without), flight)
+    change_sets = [changes] if isinstance(changes, Mapping) else changes
+    return require_available(whatif.what_if(ekf2_model, change_sets, without), flight)

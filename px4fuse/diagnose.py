@@ -1,4 +1,4 @@
-"""Diagnosis of one flight from its request, in these steps.
+"""Diagnosis of one flight: from a request (files and settings) to the faults, in seven steps.
 
 1. read: log → Flight
 2. prepare: position source, time span and axes
@@ -73,7 +73,7 @@ def diagnose(
     flight : Flight, optional
         Flight from the files of the request; without it, the files are read.
     as_sent : bool
-        True to skip the check of axes, unit and clock of the positions, as in a quiz.
+        True to use axes, unit and timestamps of the positions as sent to PX4, without a check.
 
     Raises
     ------
@@ -123,16 +123,17 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
 
 
 def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
-    """Replace a wrong delay from the convention check by the more precise time offset.
+    """Replace the delay of the timestamps in the finding by the more precise estimate ``clock``.
 
-    This changes the finding only. KF is not run again: :func:`prepare` has already subtracted the
-    delay of the check from the timestamps, and the re-runs try the rest (``clock.remaining_s``).
+    KF is not run again: :func:`prepare` has already subtracted the first estimate of the delay, and
+    the re-runs test the remaining offset, ``clock.remaining_s``.
     """
     if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
         return comparison
     # a time offset is negative if the timestamps are late
     refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
-    # a refined delay that is too small for a finding would hide the correction of the timestamps
+    # If the refined delay is too small for a finding, the first estimate is kept: the report must
+    # contain the delay that prepare subtracted
     is_fault = all(
         convention_faults(convention, comparison.flight, comparison.source.frame).late_s
         for convention in (comparison.convention, refined_convention)
@@ -211,7 +212,7 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run the filters without each error."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run with single errors corrected."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     # all parameter sets of this step are replayed together, which is faster than one by one
@@ -232,7 +233,7 @@ def rerun(
 def diagnose_or_check_aids(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis | AidsOnlyAnalysis:
-    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
+    """Run :func:`diagnose`, or check only EKF2's aiding sources if the flight has no positions.
 
     Raises
     ------
@@ -294,7 +295,7 @@ def run_what_if(
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
-    except MissingDataError:  # changes that the user gave need no estimates
+    except MissingDataError:  # only the default changes are computed from the comparison
         if is_default_change:
             raise
     if comparison is not None:
@@ -313,13 +314,7 @@ def run_what_if(
 
 
 def require_available(result: Result | Unavailable, flight: Flight) -> Result:
-    """Return a result.
-
-    Raises
-    ------
-    MissingDataError
-        The result is unavailable.
-    """
+    """Return ``result``, or raise MissingDataError with the reason why it is unavailable."""
     if isinstance(result, Unavailable):
         reason = f"{flight.log.name}: {result.what}: {result.reason}"
         raise MissingDataError(reason, result.remedy)

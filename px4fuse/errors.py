@@ -10,8 +10,8 @@
     ├── ResultsError       a file contains no results of px4fuse that this version reads
     └── OutputError        a result cannot be written
 
-The text is one line: the fault, its place, and an action. The command line replaces arguments in
-backticks (`sigma_z_m`) by its options, and ends with exit code 2.
+The text is one line: the error, the file or setting, and advice. The command line replaces Python
+arguments in backticks (`sigma_z_m`) by options (--sigma-z), and ends with exit code 2.
 """
 
 from collections.abc import Iterable
@@ -48,9 +48,9 @@ class Px4FuseError(Exception):
     Parameters
     ----------
     reason : str
-        The fault and its place.
+        The error, with the file or setting that causes it.
     remedy : str
-        The action, as a sentence; empty if the reason contains it.
+        Advice to the user, one or more sentences; empty if the reason contains it.
     """
 
     def __init__(self, reason: str, remedy: str = "") -> None:

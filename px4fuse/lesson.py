@@ -1,6 +1,6 @@
-"""Worked Examples 1 and 2 of the lesson UAT 366, module 2 ("SLAM and sensor fusion").
+"""Worked Examples 1 and 2 of module 2 ("SLAM and sensor fusion") in the course UAT 366.
 
-Example 1 is computed with KF, Example 2 with the compass rule of ``px4fuse loop``.
+Example 1 runs the Kalman filter KF. Example 2 distributes a loop closure error along the path.
 """
 
 from collections.abc import Iterator
@@ -33,11 +33,11 @@ def example_1() -> Replay:
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
-        note="along the aisle of Example 1 in course UAT 366",
+        note="aisle of Example 1 in the course UAT 366",
         measurement_time_s=time,
         measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
         acceleration=Unavailable(
-            "acceleration", "Example 1 has no acceleration", "No action is needed."
+            "acceleration", "Example 1 has no acceleration", "No action is needed for Example 1."
         ),
     )
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))

@@ -39,7 +39,7 @@ class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of all requests and of the position file."""
 
     def without_paths(self) -> Self:
-        """Return the request with file names instead of paths, as the results contain it."""
+        """Return the request with file names instead of paths, for the results."""
         paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
         changes: dict[str, Any] = {
             field_name: _file_name(path) for field_name, path in paths.items() if path is not None
@@ -105,7 +105,7 @@ class ComparisonRequest(
 
 
 class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Landing place and heading relative to take-off.
+    """Landing place and final heading relative to take-off, measured by the user.
 
     Attributes
     ----------
@@ -251,7 +251,7 @@ def _option_names(
 ) -> dict[str, str]:
     """Return the command line option of each optional field of a request, by field name.
 
-    An option is the field name with hyphens and without unit, except for ``renamed_options``.
+    For example, the option of ``max_gap_s`` is ``--max-gap``. ``renamed_options`` are exceptions.
     """
     option_names = {
         field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
@@ -261,7 +261,7 @@ def _option_names(
     return option_names | renamed_options
 
 
-# Command line option for each field of a request that is not an argument of the command
+# Command line options of the fields of requests, except positional arguments such as LOG
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     ComparisonRequest: _option_names(ComparisonRequest, ["position"], axes="--axis")
     | _POSITION_OPTIONS,
@@ -278,7 +278,7 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Option of each argument that the errors of several commands contain
+# Options of arguments that occur in the error messages of several commands
 _SHARED_OPTION_NAMES = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 

@@ -227,7 +227,10 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = align(flight, replace(file, frames=(frame,) if frame else ()))
     assert alignment.frame == frame
-    assert alignment.frame_reason == "the column names of the position file show the frame"
+    assert (
+        alignment.frame_reason
+        == "the column names of the position file contain the axis directions"
+    )
 
 
 def test_align_position_file_on_diagonal_path_requires_frame() -> None:

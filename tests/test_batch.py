@@ -181,7 +181,9 @@ def test_batch_summary_counts_logs_by_failure_reason(capsys):
     show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
-    assert f"{len(failed)} logs, for example {failed['log'].iloc[0]}: failed: {DAMAGED[0]}" in said
+    first_log = failed["log"].iloc[0]
+    line = f"{len(failed)} logs without results, for example {first_log}: failed: {DAMAGED[0]}"
+    assert line in said
     assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
@@ -396,7 +398,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"12345")
-    assert [(log.name, log.log) for log in find_logs(["logs"])] == [
+    assert [(log.name, log.table_path) for log in find_logs(["logs"])] == [
         ("a.TLOG", "logs/deep/a.TLOG"), ("b.ulg", "logs/b.ulg"), ("d[1].ulg", "logs/d[1].ulg"),
         ("e.ULG.gz", "logs/e.ULG.gz"),
     ]  # fmt: skip
@@ -407,7 +409,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     memory = fsspec.filesystem("memory")
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])
-    assert (log.name, log.log) == ("x.ulg", "memory:///fleet/x.ulg")
+    assert (log.name, log.table_path) == ("x.ulg", "memory:///fleet/x.ulg")
     found = analysed(log.address)
     assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
     (small,) = analysed(log.address, max_bytes=10).rows

@@ -69,7 +69,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     ]
 
 
-def test_diagnosis_html_shows_explained_verdict_without_bold() -> None:
+def test_diagnosis_html_verdict_with_known_cause_is_not_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
     html = axis_html([one], "along the aisle")
     assert "loud" not in html

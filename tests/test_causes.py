@@ -26,7 +26,7 @@ def test_fault_table_contains_only_existing_fault_names() -> None:
     assert listed | set(CONSEQUENCES) <= set(TITLES)
 
 
-def test_fault_table_lists_consequences_before_their_causes() -> None:
+def test_fault_table_order_puts_consequence_before_cause() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause

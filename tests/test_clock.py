@@ -38,6 +38,7 @@ from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
     CONSTANT_SIGMAS,
+    INTEGRATION_STEP_S,
     START_PRECISION,
     Signals,
     make_signals,
@@ -97,18 +98,20 @@ def level_signals(
 def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
-    _, speed, value = np.moveaxis(signals.table, 1, 0)
-    assert signals.table.shape == (len(t), 3, 3, len(CONSTANT_SIGMAS))
+    speed = signals.table[:, 1]
+    value = np.diff(speed, axis=0) / INTEGRATION_STEP_S
+    assert signals.table.shape == (len(t), 2, 3, len(CONSTANT_SIGMAS))
     np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
-    tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(t), 1, 1))
-    np.testing.assert_allclose(value[:, :, 1:4], tilted, atol=1e-12)
+    tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(value), 1, 1))
+    np.testing.assert_allclose(value[:, :, 1:4], tilted, atol=1e-9)
     # a gyro bias b about north for t seconds tilts by -b t: (-t, 0, 0) × f, in each step's middle
-    np.testing.assert_allclose(value[:, 1, 4], -g * (t + t[1] / 2.0), atol=1e-9)
+    np.testing.assert_allclose(value[:, 1, 4], -g * (t[:-1] + t[1] / 2.0), atol=1e-9)
     np.testing.assert_allclose(value[:, [0, 2], 4], 0.0, atol=1e-9)
     np.testing.assert_allclose(speed[:, 1, 4], -g * t**2 / 2.0, atol=1e-9)
     # an accelerometer bias b adds -R b
-    np.testing.assert_allclose(value[:, :, 7:10], np.tile(-np.eye(3), (len(t), 1, 1)), atol=1e-12)
+    acceleration_bias = np.tile(-np.eye(3), (len(value), 1, 1))
+    np.testing.assert_allclose(value[:, :, 7:10], acceleration_bias, atol=1e-9)
 
 
 def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
@@ -117,7 +120,8 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
     t, middle = signals.time_s, omega * (signals.time_s + np.diff(signals.time_s)[0] / 2.0)
     circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
-    np.testing.assert_allclose(signals.table[:, 2, :, 0], circle, atol=2e-5)
+    acceleration = np.diff(signals.table[:, 1, :, 0], axis=0) / INTEGRATION_STEP_S
+    np.testing.assert_allclose(acceleration, circle[:-1], atol=2e-5)
     round_it = np.stack([np.cos(omega * t), np.sin(omega * t)], 1)
     speed = sideways / omega * (round_it - round_it[0])
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)

@@ -14,7 +14,7 @@ from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS
+from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE, UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, convention_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
@@ -35,7 +35,7 @@ UNIT_VECTORS = {
     "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
-ALL_AXES = [family.axes(quarter) for family in FAMILIES for quarter in range(4)]
+ALL_AXES = [assignment.axes(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU
 NED_TO = {"ENU": (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0), "NWU": (0.0, 1.0, 0.0, 0.0)}
@@ -257,7 +257,7 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), FAULTS)
-def test_wrong_axes_unit_or_time_offset_is_only_reported_fault(name, kind):
+def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 
@@ -381,3 +381,12 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     flight = read_log(shared("cases") / file)
     track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")
     assert_found(check_convention(flight, track), **expected)
+
+
+def test_convention_check_without_heights_keeps_horizontal_positions() -> None:
+    flight = simulate_flight(Scenario(seed=5), parse_mistakes(["no-vvo"]))
+    prepared = prepare(flight)
+    assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)
+    assert prepared.source.samples["down_m"].isna().all()
+    convention = prepared.convention
+    assert convention is None or convention.z in ("down", "up")

@@ -102,7 +102,7 @@ def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> 
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_shows_explained_verdict_without_bold() -> None:
+def test_report_cover_verdict_with_known_cause_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),

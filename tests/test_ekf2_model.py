@@ -80,7 +80,7 @@ def test_ekf2_model_states_between_updates_equal_predictions(model: Model, attit
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
-def test_ekf2_model_innovations_equal_those_of_simple_filter(model: Model) -> None:
+def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]

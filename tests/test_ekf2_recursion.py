@@ -173,7 +173,7 @@ GNSS_RULES = replace(
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_ekf2_position_is_reset_to_gnss_after_7_or_14_s(
+def test_ekf2_without_fusion_resets_to_gnss_after_7_or_14_s(
     gap_s, velocity_gap_s, resets_velocity, resets
 ):
     """shouldResetGpsFusion: from PX4 main of 2026 on, a position reset ignores the velocity."""
@@ -233,7 +233,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-def test_ekf2_replay_initial_correlation_equals_kalman_filter():
+def test_ekf2_replay_initial_state_correlation_equals_reference():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000

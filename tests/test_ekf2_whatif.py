@@ -269,7 +269,7 @@ def test_what_if_with_many_rejections_is_marked_unpredictable(model):
     assert none.is_predictable
 
 
-def test_what_if_result_sensitive_to_noise_is_unpredictable(model, monkeypatch):
+def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
     """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(

@@ -310,7 +310,7 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_instructor_total_points_end_pending_status(tmp_path) -> None:
+def test_instructor_total_points_clear_pending_status(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", instructor_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
@@ -423,7 +423,7 @@ def test_parse_moodle_time_accepts_english_german_and_iso_dates(text: str) -> No
     assert parse_moodle_time(text) == datetime(2026, 11, 20, 23, 58)
 
 
-def test_instructor_overrides_csv_unquoted_comma_names_row(tmp_path: Path) -> None:
+def test_overrides_csv_unquoted_comma_error_names_row(tmp_path: Path) -> None:
     path = tmp_path / "overrides.csv"
     path.write_text("id,item,points,comment\n0001,,,Good, but late\n", encoding="utf-8")
     with pytest.raises(SettingsError, match="row 2 has more cells than the header"):

@@ -388,7 +388,7 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
         assert "a constant 120" in evaluate(same, reference, alignment="se3").notes[0]
 
 
-def test_evaluate_estimate_of_body_point_corrects_lever_arm() -> None:
+def test_evaluate_estimate_of_camera_pose_removes_lever_arm() -> None:
     reference, arm_m = flight(), np.array([0.4, -0.1, 0.0])
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
     position_m = reference.position_m + reference.rotation.apply(arm_m)
@@ -418,7 +418,7 @@ def test_evaluate_frozen_estimate_scores_only_time_before() -> None:
 
 
 @pytest.mark.parametrize(("restarts", "cause"), [(True, "restart of the map"), (False, "lost")])
-def test_evaluate_names_jump_of_estimate(restarts: bool, cause: str) -> None:
+def test_evaluate_estimate_with_jump_states_cause_and_time(restarts: bool, cause: str) -> None:
     reference = flight()
     middle, position_m = len(reference) // 2, reference.position_m.copy()
     position_m[middle:] += position_m[0] - position_m[middle] if restarts else [3.0, 0.0, 0.0]

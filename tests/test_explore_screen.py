@@ -164,7 +164,7 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
     assert f"{format_ratio(truth.ratio)} overconfident" in label
 
 
-def test_explore_page_apply_button_sets_values_of_command(
+def test_explore_page_apply_button_takes_recommended_values(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
     analysis = diagnose(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY as ROOT
 
-from px4fuse.batch.changes import SETTING_LABELS
+from px4fuse.batch.changes import SETTING_PATHS_BY_LABEL
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import ChosenSettings
@@ -177,7 +177,7 @@ def test_each_kf_setting_has_option_range_and_result_field() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)
-    assert {f"settings.{name}" for name in names} <= set(SETTING_LABELS.values())
+    assert {f"settings.{name}" for name in names} <= set(SETTING_PATHS_BY_LABEL.values())
     assert set(SETTING_RANGES) == {
         name for name in names if isinstance(getattr(Settings(), name), float)
     }

@@ -12,7 +12,7 @@ from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
-def test_choices_of_figure_have_one_right_answer_of_its_fault() -> None:
+def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
     for number in range(20):
         choices = draw_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
@@ -25,14 +25,14 @@ def test_choices_of_figure_have_one_right_answer_of_its_fault() -> None:
         assert len(form.encode()) < MAX_FORM_BYTES
 
 
-def test_right_letters_of_figures_occur_equally_often() -> None:
+def test_right_choices_of_figure_questions_are_equally_frequent() -> None:
     draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for draw_number in draws for _, letter in draw_choices(draw_number)]
     for name in CHOICE_NAMES:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
 
-def test_answers_about_figures_differ_between_faults() -> None:
+def test_answers_to_figure_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
         assert len({getattr(fault, field) for fault in FAULTS.values()}) == len(FAULTS)
 

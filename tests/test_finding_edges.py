@@ -352,7 +352,7 @@ def test_report_on_error_beyond_sigma_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_is_tested_after_alignment(
+def test_position_error_is_compared_with_sigma_after_alignment(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -531,7 +531,7 @@ def test_heading_drift_report_states_heading_at_start_and_end() -> None:
 
 @pytest.mark.parametrize("noise_is_wrong", [False, True])
 @pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
-def test_heading_error_with_wrong_gnss_noise_names_this_noise(degrees, noise_is_wrong) -> None:
+def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) -> None:
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(

@@ -68,7 +68,7 @@ def flying(noise_m_s: float = 0.3) -> Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_optical_flow_mean_is_computed_from_filtered_velocity(tmp_path):
+def test_mean_flow_per_update_is_recovered_from_filtered_flow(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -107,7 +107,7 @@ def test_optical_flow_mean_is_computed_from_filtered_velocity(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_optical_flow_mean_equals_velocity_at_time_of_update(every):
+def test_mean_flow_velocity_equals_velocity_at_update_time(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)

@@ -142,7 +142,7 @@ ATTACKS: dict[str, tuple[str, str | float]] = {
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-def test_attack_on_answer_form_is_refused_or_earns_less(name: str, tmp_path: Path) -> None:
+def test_manipulated_answer_form_is_refused_or_loses_points(name: str, tmp_path: Path) -> None:
     text, expected = ATTACKS[name]
     file = tmp_path / "answers.toml"
     file.write_text(text, encoding="utf-8", newline="")
@@ -168,7 +168,7 @@ def test_fault_named_on_clean_flight_earns_no_points_for_faults(kinds, tmp_path:
     assert named.fraction < 0.5 * form_points(right(CLEAN), CLEAN).fraction
 
 
-def test_equal_letters_about_figures_of_two_students_are_flagged() -> None:
+def test_two_students_with_equal_figure_answers_are_flagged() -> None:
     form = Answers(log_sha256=SHA256, choices=("a", "b", "", "c", "d", "e", "a"))
     reports = [
         graded_report(name, 5.0, student_id=name, form=replace(form, choices=choices))

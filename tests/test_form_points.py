@@ -169,7 +169,7 @@ def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_answer_on_open_loop_without_size_earns_partial_points() -> None:
+def test_answer_loop_error_without_size_earns_partial_points() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")

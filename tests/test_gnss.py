@@ -444,7 +444,7 @@ def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_gnss_settings_match_independent_replay(models):
+def test_what_if_with_gnss_settings_equals_independent_replay(models):
     """The simulated delay and noise; expected numbers are from an independent replay."""
 
     def error_m(name: str, **settings: float) -> tuple[float, float, float]:

@@ -17,7 +17,7 @@ from cli_tools import error_line, run_checked
 from conftest import LOG
 
 import px4fuse
-from px4fuse.api import COLUMNS
+from px4fuse.api import SUMMARY_COLUMNS
 from px4fuse.results.reading import read_results
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
@@ -127,12 +127,12 @@ def test_settings_errors_name_python_argument_or_command_option(sample_log):
 
 def test_python_table_contains_the_numbers_of_the_results(analysis) -> None:
     table = px4fuse.table(analysis)
-    assert list(table.columns) == list(COLUMNS)
+    assert list(table.columns) == list(SUMMARY_COLUMNS)
     assert list(table.index) == [(axis, name) for axis in analysis.axes for name in ("kf", "ekf2")]
     for (axis, name), row in table.drop(("down", "ekf2")).iterrows():
         summary = analysis[axis].filters[name]
         assert (row["nis_low"], row["nis_high"]) == summary.nis_band
-        for column in set(COLUMNS) - {"nis_low", "nis_high"}:
+        for column in set(SUMMARY_COLUMNS) - {"nis_low", "nis_high"}:
             truth = column in type(summary.truth).__struct_fields__ and column != "count"
             assert row[column] == getattr(summary.truth if truth else summary, column)
 

@@ -43,7 +43,7 @@ def test_item_discrimination_equals_correlation_with_other_items() -> None:
         assert item.fractions == pytest.approx(tuple(POINTS[:, index] / 10.0))
 
 
-def test_item_analysis_of_four_reports_has_no_discrimination() -> None:
+def test_item_analysis_of_four_reports_omits_discrimination() -> None:
     assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
 
 
@@ -56,6 +56,12 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
     assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
     assert fault.csv_row[1:3] == ("5", "0.6")
+
+
+def test_item_analysis_excludes_items_that_await_points() -> None:
+    text = Item("Text", 0.0, 20.0, "", True, True)
+    reports = [replace(each, items=(*each.items, text)) for each in REPORTS]
+    assert [item.title for item in analyse_items(reports)] == ["A", "B", "C"]
 
 
 def test_item_analysis_excludes_reports_pending_review() -> None:

@@ -92,9 +92,9 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     system = factorise(length, noise, joined, precision)
     state = system.solve(*signals).reshape(3, 2 * count)
     np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
-    (first, second), explained = system.whiten(*signals)
+    intervals, explained = system.whiten(*signals)
     over_sigma = np.sqrt(precision[:, 0]) * measured
-    products = over_sigma @ over_sigma.T + first @ first.T + second @ second.T
+    products = over_sigma @ over_sigma.T + intervals @ intervals.T
     products -= explained @ explained.T
     np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
     log_determinant += np.linalg.slogdet(normal)[1]

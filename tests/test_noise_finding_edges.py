@@ -77,7 +77,7 @@ def trial(
         (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_severity_of_wrong_noise_setting_depends_on_its_factor(
+def test_wrong_noise_severity_depends_on_ratio_to_estimate(
     chosen: float, estimate: Noise, expected: Any
 ) -> None:
     off = noises.setting_deviation("sigma_z_m", chosen, estimate)
@@ -123,7 +123,7 @@ def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expect
         (0.5, None, ("note", noises.NO_IMPROVEMENT)),
     ],
 )
-def test_rerun_of_consistent_kf_does_not_refute_noise_estimate(
+def test_noise_error_remains_if_kf_was_consistent_before_rerun(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -208,9 +208,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_process_noise_report_requires_correlation(
-    one: Any, expected: str | None
-) -> None:
+def test_near_zero_q_report_requires_correlated_innovations(one: Any, expected: str | None) -> None:
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 

@@ -60,7 +60,7 @@ def outcome(request: ComparisonRequest) -> str:
     return repr((*inputs, source.description, compared.segment, compared.settings, numbers))
 
 
-def test_each_option_of_compare_is_tested_with_another_value() -> None:
+def test_each_compare_option_is_tested_with_non_default_value() -> None:
     assert set(CHANGED) == set(ComparisonRequest.__struct_fields__)
 
 

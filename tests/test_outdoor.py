@@ -248,7 +248,7 @@ def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
 
 
-def test_simulate_with_ineffective_ekf2_noise_raises_error() -> None:
+def test_simulate_ekf2_noise_below_reported_one_raises_error() -> None:
     with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
         simulate(OUTDOOR, parse_mistakes(["ekf2-noise=0.05"]))
     parameters = simulate(OUTDOOR, parse_mistakes(["ekf2-noise=0.8"])).parameters

@@ -151,7 +151,7 @@ def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_pose_graph_of_square_loop_corrects_by_distance(dimension: int) -> None:
+def test_square_loop_closure_error_is_spread_by_distance(dimension: int) -> None:
     """With equal variance per metre and exact rotations the correction grows with distance."""
     free, side = TANGENT[dimension], 10
     step = np.zeros((4 * side, free))

@@ -165,7 +165,7 @@ def test_read_results_ignores_fields_of_newer_minor_version():
 
 @pytest.mark.parametrize(
     ("provenance", "said"),
-    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "px4fuse of that schema version.")],
+    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the version that wrote the results.")],
 )
 def test_read_results_of_schema_3_names_px4fuse_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:

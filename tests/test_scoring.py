@@ -244,7 +244,7 @@ class TestScore:
         assert zero.instructor_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_report_on_log_of_other_student_is_graded_by_rubric_rule(self, student_id):
+    def test_points_of_other_students_log_depend_on_rubric_rule(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (

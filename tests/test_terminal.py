@@ -102,7 +102,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
 
 def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
     console = Console(width=30, highlight=False)
-    print_paragraph(console, "one two three four five six seven", "Label", 9)
+    print_paragraph(console, "one two three four five six seven", "Label", indent=9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 

@@ -230,7 +230,7 @@ def to_z_up(rows: list[str]) -> list[str]:
     return converted
 
 
-def test_loop_on_z_up_track_has_zero_error_to_its_reference(tmp_path) -> None:
+def test_loop_on_z_up_track_equal_to_reference_has_zero_error(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
         write(tmp_path / name, to_z_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]

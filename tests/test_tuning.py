@@ -11,6 +11,7 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
+from px4fuse.filter import fitting
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -59,6 +60,39 @@ def test_tuned_noise_95_percent_interval_contains_true_value(name: str, true: fl
 
 def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
+
+
+def test_long_flight_fit_equals_fit_of_all_measurements(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The fit that starts at the first measurements has the same result, also with outliers."""
+    axis = modelled(3, 1300)
+    outliers = np.arange(20, 1300, 40)
+    measured_m = axis.measurement_m.copy()
+    measured_m[outliers] += 1.5
+    axis = replace(axis, measurement_m=measured_m)
+    expected = tuned(axis)
+    monkeypatch.setattr(fitting, "FIRST_MEASUREMENTS", 400)
+    found = tuned(axis)
+    for name in ("sigma_a_two_state", "sigma_z"):
+        noise, expected_noise = getattr(found, name), getattr(expected, name)
+        interval = expected_noise.high - expected_noise.low
+        assert noise.value == pytest.approx(expected_noise.value, abs=0.05 * interval)
+    np.testing.assert_array_equal(found.outlier_time_s, expected.outlier_time_s)
+    assert set(axis.measurement_time_s[outliers]) <= set(found.outlier_time_s)
+
+
+def test_tune_of_fast_source_finds_outliers_in_skipped_rows() -> None:
+    """Only every fourth position is used for the noises at 100 Hz."""
+    axis = modelled(4, 2000)
+    fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
+    measured_m = 0.1 * np.random.default_rng(4).standard_normal(2001)
+    measured_m[1000:1003] += 5.0
+    found = tuned(replace(fast, measurement_m=measured_m))
+    expected_s = fast.measurement_time_s[1000:1003]
+    np.testing.assert_array_equal(found.outlier_time_s, expected_s)
+    assert found.count == 2000
+    assert found.sigma_z.value == pytest.approx(0.1, rel=0.1)
 
 
 def test_true_noises_have_no_likelihood_gain_on_held_out_data() -> None:

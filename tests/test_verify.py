@@ -118,7 +118,7 @@ def test_verify_report_without_log_returns_cannot_verify(
         verdict = verify(read_attached_results(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
         assert verdict.reasons == (NO_LOG_REASON,)
-        assert verdict.redrawn == b""
+        assert verdict.redrawn_pdf == b""
         assert not verdict.with_log
 
 
@@ -165,7 +165,7 @@ def test_verify_accepts_report_of_other_operating_system(
         read_attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere
     )
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
-    assert verdict.redrawn == aside
+    assert verdict.redrawn_pdf == aside
 
 
 def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> None:
@@ -338,7 +338,7 @@ def test_verify_report_with_changed_student_name_is_not_verified(
     verdict = verify(read_attached_results(pdf), pdf, loop.files, recompute=lambda *_: again)
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
-    assert verdict.redrawn != loop.pdf
+    assert verdict.redrawn_pdf != loop.pdf
     named = any("matplotlib 9.9.9; this" in reason for reason in verdict.reasons)
     assert named == (path[-1] == "matplotlib")
 
@@ -393,7 +393,7 @@ def test_verify_detects_changed_plot_with_other_library_versions(
     assert "page 1: drawing operation" in verdict.reasons[0]
     assert any("made with matplotlib 3.99.0; this" in reason for reason in verdict.reasons)
     assert verdict.remedy.startswith("Verify the report with matplotlib 3.99.0.")
-    assert verdict.redrawn == foreign.again[1]()
+    assert verdict.redrawn_pdf == foreign.again[1]()
 
 
 # -- what is changed on the pages ------------------------------------------------------------------
@@ -462,7 +462,7 @@ def test_verify_report_with_changed_page_returns_page_differs(
     aisle: VerifiedReport, page: int, name: str
 ) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
-    assert verdict.redrawn == aisle.pdf  # the redrawn report does not contain the forgery
+    assert verdict.redrawn_pdf == aisle.pdf  # the redrawn report does not contain the forgery
     assert verdict.status == "verified"
     assert verdict.outcome == "page differs", verdict
     assert [one.page for one in verdict.pages] == [page]
@@ -491,7 +491,7 @@ def test_verify_report_with_changed_pdf_document_states_reason(
 ) -> None:
     forge, expected, said = DOCUMENT[name]
     verdict = aisle.verified(forged(aisle.pdf, forge))
-    assert verdict.redrawn == aisle.pdf
+    assert verdict.redrawn_pdf == aisle.pdf
     assert verdict.outcome == expected, verdict
     assert verdict.status == ("verified" if expected == "page differs" else expected)
     assert any(said in reason for reason in verdict.reasons), verdict
@@ -568,9 +568,9 @@ def test_verify_gives_expected_outcome_for_each_pdf_change(
     pdf = forge(aisle, loop)
     read_report(pdf, "r.pdf")
     verdict = aisle.verified(pdf)
-    assert verdict.redrawn in (b"", aisle.pdf)
+    assert verdict.redrawn_pdf in (b"", aisle.pdf)
     assert verdict.outcome in expected, verdict
-    assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
+    assert verdict.redrawn_pdf == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
 def test_verify_with_log_of_other_flight_returns_other_log(aisle: VerifiedReport) -> None:

@@ -209,7 +209,7 @@ def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_ekf2_replay_of_vision_and_gnss_equals_simple_filter(
+def test_ekf2_replay_of_vision_and_gnss_equals_reference(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)

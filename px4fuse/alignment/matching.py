@@ -19,13 +19,13 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
 # Frames tried for a position file with estimated yaw: nwu is the same as enu rotated by 90°
 ESTIMATED_YAW_FRAMES = ("ned", "enu")
-# Frames tried for a position file with the yaw of the user: on level flights along one axis, frames
-# with y up or down cannot be distinguished from frames with z up
+# Frames tried for a position file with the user's yaw. Frames with y up or down (eus, edn) are not
+# tried: a level flight along one axis cannot distinguish them from frames with z up
 GIVEN_YAW_FRAMES = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file: matching a day of positions takes five seconds
 MAX_SPAN_S = 86400.0
-# Minimum value of Lin's concordance correlation coefficient (1989) for a match without a warning,
-# by reference; a worse match does not show that the frame is rotated
+# Minimum of Lin's concordance correlation coefficient (1989), by reference, for a match without a
+# warning and for a check of the user's yaw
 MIN_GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
@@ -41,18 +41,18 @@ MIN_ROTATED_RESIDUAL_M = 0.3
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Positions of a file, and the alignment parameters that the user gave; None: estimated.
+    """Positions of a file, and the alignment parameters from the user (None: to be estimated).
 
     Attributes
     ----------
     samples : DataFrame
         Positions on the clock of the file.
     frames : tuple of str
-        Possible frames of the file; empty if unknown.
+        Possible directions of x, y and z in the file, such as ("enu",); empty if unknown.
     yaw_rad : float or None
         Yaw of the file's frame relative to the frame of EKF2.
     lag_s : float or None
-        Flight time of the first sample.
+        Flight time (s) of the first position in the file.
     """
 
     samples: pd.DataFrame
@@ -63,20 +63,21 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Match of the position file with one reference, EKF2 or the IMU.
+    """Best fit of the position file to a reference track: EKF2's position or the IMU's.
 
     Attributes
     ----------
     reference : SampledTrack
     frame : str
+        Directions of x, y and z in the file, such as "enu".
     residuals_m : dict from frame to float
-        Residual in each tried frame, best first.
+        RMS residual in each tried frame, best first.
     fit : Fit
-        Fit with the yaw of the user, if given.
+        Fit with the user's yaw; equal to ``free_yaw_fit`` without it.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool
-        True if the yaw of the user is wrong.
+        True if the user's yaw is wrong: ``free_yaw_fit`` is much better than ``fit``.
     """
 
     reference: SampledTrack
@@ -88,7 +89,7 @@ class Match:
 
     @property
     def time_offset_fit(self) -> Fit:
-        """Fit with the better time offset: a wrong yaw of the user would bias the offset."""
+        """Fit whose time offset is used. A wrong yaw from the user would bias the time offset."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
@@ -100,14 +101,14 @@ class Match:
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match the position file with EKF2's position, or else with the IMU.
+    """Match the position file with EKF2's position or, if this fails, with the IMU.
 
-    Return None if there is no match, and the user gave all parameters.
+    Return None if both fail, but the user gave all parameters.
 
     Raises
     ------
     NoMatchError
-        A parameter cannot be estimated.
+        Both fail, so a parameter that the user did not give cannot be estimated.
     """
     value_by_option = {
         "clock_offset_s": problem.lag_s,
@@ -174,7 +175,6 @@ def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Return True if the match is good, and no other time offset fits nearly as well."""
     return (
         fit.concordance >= MIN_GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO

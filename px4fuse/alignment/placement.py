@@ -47,15 +47,17 @@ MAX_EXPLAINED_SPAN_S = 7200.0
 def _explain_mismatch(
     flight: Flight, problem: AlignmentProblem, metres_per_unit: float
 ) -> tuple[str, str] | None:
-    """Return fault and action if the IMU data show wrong axes or a wrong unit of the file."""
+    """Return error message and advice if the IMU contradicts axes or unit of the file."""
     samples = problem.samples
     span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
     if span_s > MAX_EXPLAINED_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
     positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
-    table = pd.DataFrame(positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION)
-    track = PositionTrack("", POSITION_FILE, "", table, "unknown", "", ())
+    position_samples = pd.DataFrame(
+        positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
+    )
+    track = PositionTrack("", POSITION_FILE, "", position_samples, "unknown", "", ())
     search_limits = {} if problem.lag_s is not None else {"max_offset_s": span_s}
     convention = check_convention(flight, track, **search_limits)
     if convention is None or convention.verdict != "determined":
@@ -79,7 +81,7 @@ def _explain_mismatch(
 
 
 # Maximum ratio of the second best to the best residual for a warning about an ambiguous time
-# offset, by reference: IMU noise gives ratios of 1.4 to 1.7
+# offset, by reference. Correct matches with the noisy IMU have ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
@@ -150,7 +152,7 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
-    frame_reason = "the column names of the position file show the frame"
+    frame_reason = "the column names of the position file contain the axis directions"
     if recording.format:
         frame_reason = f"files of the format {recording.format} have this frame"
     if frame:
@@ -223,14 +225,14 @@ def _describe_alignment(
     lag_s = problem.lag_s or 0.0
     yaw_sigma_deg = clock_sigma_s = correlation = residual_rms_m = None
     origin_m = np.zeros(3)
-    reference = ""
+    reference_name = ""
     clock_reason = "the offset was given with --clock-offset"
     if match:
         frame = match.frame
-        reference = match.reference.name
+        reference_name = match.reference.name
         if len(problem.frames) != 1:
             frame_reason = (
-                f"this frame has the smallest residual against the {reference} "
+                f"this frame has the smallest residual against the {reference_name} "
                 f"({match.residuals_text})"
             )
             if is_yaw_free and frame == "enu":
@@ -238,22 +240,22 @@ def _describe_alignment(
         if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
-            yaw_reason = f"the yaw was estimated with the {reference}"
-            origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
+            yaw_reason = f"the yaw was estimated with the {reference_name}"
+            origin_m = match.fit.origin_m if reference_name == EKF2_POSITION else origin_m
         if clock_offset_s is None:
             lag_s = match.time_offset_fit.lag_s
             clock_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             clock_reason = (
-                f"the offset was estimated with the {reference} and includes the delay of the "
-                f"{reference}"
+                f"the offset was estimated with the {reference_name}; if the {reference_name} is "
+                "late, the offset contains this delay"
             )
         correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
-    ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
+    ekf2_comparison = None if reference_name == IMU else _compare_with_ekf2(flight, aligned_samples)
     distance_m = None
     if ekf2_comparison:
-        reference = EKF2_POSITION
+        reference_name = EKF2_POSITION
         distance_m, correlation = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_m**2) / 2.0))
     frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_free)] if match else []
@@ -287,7 +289,7 @@ def _describe_alignment(
         clock_offset_s=float(clock_offset_s or 0.0),
         clock_offset_sigma_s=clock_sigma_s,
         clock_reason=clock_reason,
-        reference=reference,
+        reference=reference_name,
         correlation=correlation,
         residual_rms_m=residual_rms_m,
         misplaced=(frame_conflict,) if frame_conflict else (),
@@ -335,7 +337,7 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    # GNSS determines EKF2's origin to about 1 m
+    # A smaller shift is not reported, because GNSS determines EKF2's origin to about 1 m
     if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG and shift_m < MIN_NAMED_SHIFT_M:
         return ""
     return (

@@ -16,9 +16,9 @@ MAX_LAG_SHIFT_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance in the likelihood, so that the longer of two nearly perfect matches
-# has the larger likelihood
-MIN_DISCORDANCE = 1e-4
+# Lower limit of 1 - concordance in the log-likelihood ratio: of two nearly perfect matches, the
+# longer one then has the larger likelihood
+MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
 # Residual (m) that the time grid causes even if both tracks match perfectly
@@ -106,7 +106,9 @@ def find_correlation_peak(
     )
     concordance = np.zeros_like(power_sum)
     concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power_sum[has_overlap]
-    likelihood_gain = -common_count * np.log(np.maximum(1.0 - concordance, MIN_DISCORDANCE))
+    likelihood_gain = -common_count * np.log(
+        np.maximum(1.0 - concordance, MIN_ONE_MINUS_CONCORDANCE)
+    )
     best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
 
     def lag_at(index: int) -> float:
@@ -114,9 +116,13 @@ def find_correlation_peak(
 
     # Lags around the best lag with more than half of its concordance, and lags nearer than
     # MIN_PEAK_DISTANCE_S, are the same peak
-    low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
-    peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
-    peak_end = np.min(low_indices[low_indices > best_index], initial=len(common_count))
+    low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
+    peak_start_index = np.max(
+        low_concordance_indices[low_concordance_indices < best_index], initial=-1
+    )
+    peak_end_index = np.min(
+        low_concordance_indices[low_concordance_indices > best_index], initial=len(common_count)
+    )
     is_other_peak = (
         has_overlap
         & (common_count >= 0.5 * common_count[best_index])
@@ -124,8 +130,8 @@ def find_correlation_peak(
         & (concordance >= MIN_CONCORDANCE[reference.name])
     )
     min_peak_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
-    same_peak_start = max(peak_start + 1, best_index - min_peak_distance)
-    is_other_peak[same_peak_start : min(peak_end, best_index + min_peak_distance + 1)] = False
+    same_peak_start = max(peak_start_index + 1, best_index - min_peak_distance)
+    is_other_peak[same_peak_start : min(peak_end_index, best_index + min_peak_distance + 1)] = False
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
@@ -164,8 +170,7 @@ def fit_by_least_squares(
     is_used = is_known & file_track.is_valid
     if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
-            f"only {np.count_nonzero(is_used)} positions of the file are within the time of the "
-            "reference"
+            f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_m = file_track.horizontal_m[is_used]
@@ -251,8 +256,8 @@ def _robust_scale(residual: Array) -> float:
 def _autocorrelation_factor(residual: Complex) -> float:
     """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
     clip_limit = 3.0 * _robust_scale(np.abs(residual))
-    clipped = residual * np.minimum(1.0, clip_limit / np.maximum(np.abs(residual), 1e-12))
-    covariance_by_lag = autocovariance(clipped)
+    clipped_residual = residual * np.minimum(1.0, clip_limit / np.maximum(np.abs(residual), 1e-12))
+    covariance_by_lag = autocovariance(clipped_residual)
     if covariance_by_lag[0] <= 0.0:
         return 1.0
     zero_crossings = np.flatnonzero(covariance_by_lag <= 0.0)

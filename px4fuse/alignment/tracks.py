@@ -34,7 +34,8 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# Minimum length (s) of a gap in a track; a gap is also longer than three median intervals
+# An interval between two samples is a gap if it is longer than this time (s), and longer than three
+# median intervals
 MIN_GAP_LIMIT_S = 0.5
 # Minimum horizontal motion (m) of a track for a match
 MIN_MOTION_M = 0.5
@@ -54,7 +55,7 @@ BAND_PADDING_S = 10.0
 
 
 class NoMatchError(Exception):
-    """The position file does not match a reference; ``remedy`` is the action, if any."""
+    """The position file does not match a reference; ``remedy`` is advice to the user, or ""."""
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -179,7 +180,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     """Return the IMU acceleration integrated twice, band-pass filtered after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
-        raise NoMatchError("the log has no acceleration in NED")
+        raise NoMatchError(acceleration.reason)
     time_s = acceleration.index.to_numpy()
     velocity_m_s = cumulative_trapezoid(acceleration.to_numpy(), time_s, axis=0, initial=0)
     grid = resample_to_grid(_track_without_gaps(time_s, velocity_m_s))
@@ -192,10 +193,10 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
 def align_samples(
     samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
 ) -> pd.DataFrame:
-    """Return the samples in NED: positions R·C·p + origin, and variances.
+    """Convert samples of a position file to NED; ``lag_s`` is the flight time of the first sample.
 
-    R is the rotation by ``yaw_rad``, C converts the axes of ``frame`` to NED. The variances are the
-    diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
+    Positions are R·C·p + origin: C converts the axes of ``frame`` to NED, R rotates by ``yaw_rad``.
+    Variances are the diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
     """
     track = convert_to_ned(samples, frame)
     position_m = track.position_m
@@ -214,7 +215,7 @@ def align_samples(
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track without the resets that move its origin."""
+    """Return EKF2's track without position resets that only move the origin of EKF2's frame."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

@@ -21,11 +21,11 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# Maximum √(mean NEES) of a consistent filter; the minimum is 1 / maximum. The limits are wide,
+# A filter is consistent if √(mean NEES) along an axis is between 1/2 and 2. The limits are wide,
 # because errors in a flight are correlated and EKF2's output predictor delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
-# Path in the results of each setting or flight property that px4fuse diff compares, by its label
-SETTING_LABELS = {
+# Settings and flight properties that px4fuse diff compares
+SETTING_PATHS_BY_LABEL = {
     **{
         f"{SETTING_RANGES[name].label} ({SETTING_RANGES[name].unit})"
         if name in SETTING_RANGES
@@ -89,11 +89,11 @@ def _describe_input(diff_input: InputResults) -> contract.DiffInput:
     )
 
 
-def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]:
+def _setting_changes(results_a: Results, results_b: Results) -> Iterator[contract.SettingChange]:
     values_a, values_b = (
-        {name: value_at(results, path) for name, path in SETTING_LABELS.items()}
+        {label: value_at(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
         | _parameters(results)
-        for results in (a, b)
+        for results in (results_a, results_b)
     )
     for name in {**values_a, **values_b}:
         if (value_a := values_a.get(name)) != (value_b := values_b.get(name)):
@@ -129,12 +129,12 @@ def compare_numbers(
             )
         ):
             continue
-        number = number_a or number_b
-        assert number is not None
+        labelled_number = number_a or number_b
+        assert labelled_number is not None
         yield contract.NumberChange(
             path=path,
-            label=number.label,
-            unit=number.unit,
+            label=labelled_number.label,
+            unit=labelled_number.unit,
             a=getattr(number_a, "value", None),
             b=getattr(number_b, "value", None),
             a_interval=getattr(number_a, "interval", None),
@@ -142,9 +142,12 @@ def compare_numbers(
         )
 
 
-def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Yield the findings that only A or only B contains, compared by id and severity."""
-    comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
+def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contract.FindingChange]:
+    """Yield the findings whose id and severity are only in A or only in B."""
+    comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = (
+        (results_b, results_a, "B"),
+        (results_a, results_b, "A"),
+    )
     for results, other_results, only_in in comparisons:
         other_findings = {(finding.id, finding.severity) for finding in other_results.findings}
         for finding in results.findings:
@@ -153,10 +156,10 @@ def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]
 
 
 def _describe_worse_verdicts(
-    a: Results, b: Results, findings: Iterable[contract.FindingChange]
+    results_a: Results, results_b: Results, findings: Iterable[contract.FindingChange]
 ) -> Iterator[str]:
-    """Yield a sentence on each verdict that is worse in B, and on each error that only B has."""
-    verdicts_a, verdicts_b = _verdicts_by_axis(a), _verdicts_by_axis(b)
+    """Yield a sentence on each consistency verdict that is worse in B, and on each new error."""
+    verdicts_a, verdicts_b = map(_verdicts_by_label, (results_a, results_b))
     for name, (value_a, was_consistent) in verdicts_a.items():
         value_b, is_consistent = verdicts_b.get(name, (value_a, True))
         if was_consistent and not is_consistent:
@@ -176,8 +179,8 @@ def _describe_worse_verdicts(
         yield f"New finding of severity error: {finding_id}."
 
 
-def _verdicts_by_axis(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return each mean NIS and mean NEES, and True if it is consistent, by its label."""
+def _verdicts_by_label(results: Results) -> dict[str, tuple[float, bool]]:
+    """Return each mean NIS and mean NEES, and True if it is consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
         for name, label in FILTER_LABELS.items():

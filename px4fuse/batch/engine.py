@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Maximum time (s) until the Dask scheduler answers, and until it has a worker
 CONNECT_TIMEOUT_S = 15.0
-# Number of logs per Dask task: they share one process, because its imports take 2 s
+# Number of logs per Dask task, which share one process because its imports take 2 s
 JOBS_PER_TASK = 4
 
 
@@ -57,7 +57,7 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
             f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
             "Start a Dask scheduler with: dask scheduler",
         ) from error
-    # without this, Dask prints tracebacks when the scheduler ends
+    # Dask would print tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
         _check_workers(client)
         yield client
@@ -92,7 +92,7 @@ def run_jobs(
     """Run jobs on a Dask cluster, or on this computer if ``client`` is None.
 
     ``run_job_list`` runs a list of jobs in ``processes`` processes (default: the number of cores).
-    Each job is returned with its result as soon as it is finished.
+    Each job is yielded with its result as soon as it is finished.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def run_jobs(
             task_jobs = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
-            # the worker process ended several times, or cannot load the job
+            # an error means that the worker process died repeatedly or cannot unpickle the jobs
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
             results = [failure] * len(task_jobs) if error else future.result()

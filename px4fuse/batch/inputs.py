@@ -20,10 +20,10 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings that are copied from the results of one input to analyse the log of the other input
+# Settings that are copied from results to the analysis of another log
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Settings that are not copied even if both inputs belong to the same log
-_FILE_FIELDS = {"log", "system", "position"}
+# Settings that are not copied even to an analysis of the same log
+_INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class InputResults:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[InputResults, InputResults]:
-    """Read the inputs A and B; a log is analysed with the settings of the other input.
+    """Read the inputs A and B; if one is a log, analyse it with the settings in the other.
 
     Raises
     ------
@@ -79,14 +79,15 @@ def _analyse_log(path: Path, other_input: InputResults | None, progress: Progres
     if other_input is not None:
         is_same_log = other_input.results.log.sha256 in files_by_sha256([path])
         copied_settings = (
-            {*request.__struct_fields__} - _FILE_FIELDS if is_same_log else _FILTER_SETTINGS
+            {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
         )
         request = replace(
             request,
             **{name: getattr(other_input.results.request, name) for name in copied_settings},
         )
     result = diagnose_or_check_aids(request, progress)
-    text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
-    results = read_results(text.encode())
+    # to_json rounds the numbers as in a report
+    results_json = to_json(outcome_results(request, result))
+    results = read_results(results_json.encode())
     assert isinstance(results, Results)
     return InputResults(display_name(path), "log", results)

@@ -15,9 +15,10 @@ from px4fuse.request import ComparisonRequest, with_options
 
 @dataclass(frozen=True)
 class Job:
-    """Log to analyse, by its absolute path or URL, and the settings of the analysis.
+    """Log to analyse and settings of the analysis.
 
-    The log is not analysed if its SHA-256 is in ``finished_hashes``.
+    ``address`` is an absolute path or URL. A log with a SHA-256 in ``finished_hashes`` is not
+    analysed.
     """
 
     address: str
@@ -29,15 +30,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Table rows, results (JSON) and report (PDF) of one log; empty if they were not made.
+    """Table rows, results and report of one log.
 
-    ``rows`` has one row per axis, or a single row with the reason if the log could not be compared.
+    ``rows`` has one row per axis, or one row with the reason if the log could not be compared.
     """
 
     sha256: str
     rows: tuple[Row, ...] = ()
-    results: bytes = b""
-    report: bytes = b""
+    results_json: bytes = b""
+    report_pdf: bytes = b""
 
 
 def analyse(job: Job) -> Outcome:
@@ -84,15 +85,15 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
             )
             return Outcome(sha256, (row | failure_row(missing_data, NOT_COMPARED, path.name),))
         contract_results = results(request, analysis)
-        results_json, report = to_json(contract_results), b""
+        results_json, report_pdf = to_json(contract_results), b""
         if job.with_report:
             from px4fuse.report.pdf import render  # noqa: PLC0415
 
-            report = render(analysis, contract_results, results_json)
+            report_pdf = render(analysis, contract_results, results_json)
     except Px4FuseError as error:
         status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
         return Outcome(sha256, (row | failure_row(error, status, path.name),))
-    return Outcome(sha256, tuple(axis_rows(contract_results)), results_json.encode(), report)
+    return Outcome(sha256, tuple(axis_rows(contract_results)), results_json.encode(), report_pdf)
 
 
 def _sha256(path: Path) -> str:

@@ -18,19 +18,19 @@ from px4fuse.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-#: Suffixes of the files in a folder that are logs; a file that the user names may have any suffix
+#: Suffixes by which logs are found in a folder; a log given as a file may have any suffix
 LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
 
 
 @dataclass(frozen=True, order=True)
 class LogAddress:
-    """Log that was found but not read: file name, path or URL for the table, and size if known.
+    """Log that is not read yet: file name, path or URL in the table, and size if known.
 
-    ``address`` is the absolute path or URL, with which a worker process opens the log.
+    ``address`` is the absolute path or URL with which a worker process opens the log.
     """
 
     name: str
-    log: str
+    table_path: str
     address: str
     size_bytes: int | None
 
@@ -83,8 +83,8 @@ def _logs_in(pattern: str) -> list[LogAddress]:
     for path, file_info in info_by_path.items():
         address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
         is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
-        log = os.path.relpath(path) if is_relative else address
-        found_logs.append(LogAddress(_file_name(path), log, address, file_info.get("size")))
+        table_path = os.path.relpath(path) if is_relative else address
+        found_logs.append(LogAddress(_file_name(path), table_path, address, file_info.get("size")))
         if _is_local(file_system):
             add_input(Path(path))
     return found_logs

@@ -1,8 +1,8 @@
 """Numbers that ``px4fuse diff`` compares, with 95 % intervals.
 
-``measures.csv`` lists their paths in the results, such as ``axes.*.rejected_fraction``. In a path,
-``*`` stands for any axis, noise estimate or aiding source, and FILTER for KF and EKF2. The unit
-"share" is a fraction from 0 to 1.
+``measures.csv`` lists the path of each number in the results, such as
+``axes.*.rejected_fraction``: ``*`` stands for any axis, noise estimate or aiding source, FILTER for
+KF and EKF2. The unit "share" is a fraction from 0 to 1.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
 FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
-# Numbers to compare, as dicts of path, label, unit, and name of the field with the 95 % interval
+# Rows of measures.csv; "interval" is the name of the field with the 95 % interval
 MEASURES = [
     row
     | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
@@ -25,13 +25,13 @@ MEASURES = [
 ]
 # Minimum relative difference of two numbers that px4fuse diff lists
 RELATIVE_TOLERANCE = 0.01
-# Minimum difference of two numbers, in their unit, that px4fuse diff lists
+# Minimum difference of two numbers that px4fuse diff lists, in the unit of the numbers
 ABSOLUTE_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)
 class ComparedNumber:
-    """Value in the results with its label, unit, and 95 % interval if the results contain one."""
+    """Number in the results, with its 95 % interval if the results contain one."""
 
     label: str
     unit: str
@@ -44,7 +44,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # aiding sources of the position source: the results of each axis contain their numbers
+    # the numbers of these aiding sources are already in the results of each axis
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         source_aids = ("gnss_pos",)

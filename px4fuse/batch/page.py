@@ -19,8 +19,7 @@ from px4fuse.html.safe import clean_text, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
-# Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
-# verdicts of the diagnosis (Card)
+# σ ratios in the order of Card.verdicts
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
@@ -49,8 +48,8 @@ LOG_COLUMNS = [
 ]
 # Name of the group of columns that the page shows on request
 EXTRA_COLUMN_GROUP = "numbers"
-# Label of each page filter, by the first word of its tags, such as "severity:error"
-PAGE_FILTERS = {
+# Label of each drop-down list that selects logs, by the start of its tags ("severity:error")
+SELECTION_LABELS = {
     "severity": "Diagnosis",
     "status": "Status",
     "vehicle": "Vehicle",
@@ -58,15 +57,15 @@ PAGE_FILTERS = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Axes whose numbers represent the log in the table: the aisle, else north and east, else down
-MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
+# Axes with the numbers in the row of a log: the first group that the log contains
+MAIN_AXES_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 
-#: One log on the page: table columns by name, and the columns that :func:`_log_summary` adds
-Log = Mapping[str, Any]
+#: Table columns of one log, and the columns that :func:`_summarise_log` adds
+LogSummary = Mapping[str, Any]
 
 
 def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
-    """Write the table of logs as one HTML file.
+    """Return the table of logs as an HTML page.
 
     Parameters
     ----------
@@ -108,7 +107,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Findings", "rank", EXTRA_COLUMN_GROUP),
         ),
         rows=rows,
-        filters=_page_filters(logs),
+        filters=_selections(logs),
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
@@ -116,7 +115,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _log_cells(log: Log) -> tuple[Cell, ...]:
+def _log_cells(log: LogSummary) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     severity, action = log["severity"], log.get("action", "")
     style = "command" if action.startswith(("px4fuse ", "param ")) else ""
@@ -150,10 +149,10 @@ def _ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
     return Cell(format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis}")
 
 
-def sort_logs(logs: Iterable[Log]) -> list[Log]:
-    """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
+def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
+    """Sort logs by severity, then |ln(actual σ / reported σ)|, then position RMSE."""
 
-    def sort_key(log: Log) -> tuple[float, ...]:
+    def sort_key(log: LogSummary) -> tuple[float, ...]:
         ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
         largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
         return (
@@ -165,7 +164,7 @@ def sort_logs(logs: Iterable[Log]) -> list[Log]:
     return sorted(logs, key=sort_key)
 
 
-def _log_details(log: Log) -> tuple[Section, ...]:
+def _log_details(log: LogSummary) -> tuple[Section, ...]:
     axes = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -189,7 +188,7 @@ def _log_details(log: Log) -> tuple[Section, ...]:
     )
 
 
-def _side_sections(log: Log) -> tuple[Section, ...]:
+def _side_sections(log: LogSummary) -> tuple[Section, ...]:
     return (
         frame.links_section(
             "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
@@ -204,44 +203,44 @@ def _format_value(value: str | float) -> str:
     return value if isinstance(value, str) else format_number(float(value))
 
 
-def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the label and the options of each page filter, most frequent option first."""
+def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return the label and the options of each drop-down list, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
-    page_filters = []
-    for kind, label in PAGE_FILTERS.items():
+    selections = []
+    for kind, label in SELECTION_LABELS.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            page_filters.append((label, [("", "All"), *options]))
-    return page_filters
+            selections.append((label, [("", "All"), *options]))
+    return selections
 
 
 # -------------------- combination of the table rows of each log
 
 
-def logs_from_table(table: pd.DataFrame) -> list[Log]:
-    """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
+def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
+    """Combine the table rows of each log into one summary, in the order of the table."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):
         rows_by_log[row["log"]].append(
             {str(name): value for name, value in row.items() if pd.notna(value) and value != ""}
         )
-    return [_log_summary(rows) for rows in rows_by_log.values()]
+    return [_summarise_log(rows) for rows in rows_by_log.values()]
 
 
-def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
-    """Combine the rows of a log, one per axis; values of the main axes replace those of others."""
+def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
+    """Combine the table rows of one log; values of the main axes replace those of other axes."""
     axes = [row for row in rows if "axis" in row]
     main_rows = next(
         (
             axis_rows
-            for names in MAIN_AXES
+            for names in MAIN_AXES_BY_PREFERENCE
             if (axis_rows := [row for row in axes if row["axis"] in names])
         ),
         rows,
@@ -267,7 +266,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     return log | {"tags": _log_tags(log)}
 
 
-def _log_tags(log: Log) -> dict[str, str]:
+def _log_tags(log: LogSummary) -> dict[str, str]:
     tags = {
         f"severity:{log['severity']}": log["severity"],
         f"status:{log['status']}": log["status"],

@@ -20,7 +20,7 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Name of the noise estimate of an axis: north and east have one estimate, "horizontal"
+# Noise estimate of an axis: north and east have a common estimate
 _NOISE_ESTIMATE_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -31,7 +31,7 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMNS = read_rows("columns.csv")
-#: Path of each table column in the results; empty if a column combines several fields
+#: Path of each table column in the results; empty for a column made of several results
 RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
@@ -77,7 +77,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Return the table columns with findings and with verdicts on EKF2's aiding sources.
 
-    Findings that are effects of another finding are omitted.
+    A finding that is the effect of another finding is omitted.
     """
     causes = [finding for finding in findings if finding.caused_by is None]
     aid_verdicts = [
@@ -91,7 +91,7 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
 
 def card_columns(card: Card) -> Row:
-    """Return the table columns with the diagnosis, which is the same for all axes of a log."""
+    """Return the table columns with the diagnosis card, the summary of a report."""
     rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
@@ -109,7 +109,7 @@ def card_columns(card: Card) -> Row:
 
 
 def first_action(card: Card) -> str:
-    """Return the first action of a diagnosis: the commands or, without commands, the sentence."""
+    """Return the commands of the first action; the text of an action without commands."""
     if not card.causes:
         return ""
     first_cause = card.causes[0]
@@ -163,7 +163,7 @@ def clean_row(row: Row) -> Row:
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """Format the table as CSV for Excel and LibreOffice, without active formulas."""
+    """Format the table as CSV; texts that a spreadsheet would run as formulas are escaped."""
     text_columns = {
         name: table[name].map(neutralise_formulas)
         for name, kind in COLUMN_TYPES.items()

@@ -84,13 +84,12 @@ class _RunState:
     output: Path
     px4fuse: str
     settings: str
-    # SHA-256 of the logs that did not fail, by address
+    # SHA-256 of logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # First log of each content, by SHA-256; identical logs have no table rows of results
+    # first of identical logs, by SHA-256; the others get no table rows with results
     first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
-    # Table row of each log that failed, by address
-    failed_rows: dict[str, Row] = field(default_factory=dict)
-    # SHA-256 of the logs whose results are from an earlier run
+    failed_row_by_address: dict[str, Row] = field(default_factory=dict)
+    # SHA-256 of logs with results from an earlier run
     reused_hashes: set[str] = field(default_factory=set)
 
 
@@ -119,9 +118,9 @@ def run_batch(
     workers : int, optional
         Number of processes on this computer; by default the number of cores.
     memory_gb : float
-        Maximum address space for one log, of which libraries use 0.6 GB; only on Linux.
+        Maximum address space for one log, only on Linux; libraries use 0.6 GB of it.
     progress : callable
-        Called with the activity, the number of finished logs, and the number of all logs.
+        Function that receives the activity and the numbers of finished and of all logs.
     **settings
         The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
@@ -143,7 +142,7 @@ def run_batch(
         batch_result = run(
             map(str, sources), folder, reports=reports and output is not None, **settings
         )
-    # without an output folder, the files are deleted already
+    # the results in a temporary folder are deleted
     missing_files = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
     return batch_result.table.assign(**missing_files)
 
@@ -212,9 +211,13 @@ def run(
             try:
                 for number, (job, outcome) in enumerate(finished_jobs, 1):
                     _cache_outcome(state, log_by_address[job.address], outcome)
-                    progress(f"comparing logs, {len(state.failed_rows)} failed", number, len(jobs))
+                    progress(
+                        f"comparing logs, {len(state.failed_row_by_address)} failed",
+                        number,
+                        len(jobs),
+                    )
             finally:
-                if state.hash_by_address or state.failed_rows:
+                if state.hash_by_address or state.failed_row_by_address:
                     batch_result = _write_table(state, logs)
         except Px4FuseError as error:
             note = RESUME_NOTE if (output / "rows").is_dir() else ""
@@ -250,7 +253,7 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFail
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
         outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == FAILED:
-        state.failed_rows[log.address] = outcome.rows[0]
+        state.failed_row_by_address[log.address] = outcome.rows[0]
         return
     first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
     if not outcome.rows:
@@ -263,7 +266,10 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFail
 
 def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
     path_stem = f"results/{file_stem(log.name, outcome.sha256)}"
-    content_by_name = {f"{path_stem}.json": outcome.results, f"{path_stem}.pdf": outcome.report}
+    content_by_name = {
+        f"{path_stem}.json": outcome.results_json,
+        f"{path_stem}.pdf": outcome.report_pdf,
+    }
     path_by_column = {
         column: name if content_by_name[name] else ""
         for column, name in zip(OUTPUT_FILE_COLUMNS, content_by_name, strict=True)
@@ -281,12 +287,16 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
 
     def rows_of_log(log: LogAddress) -> Iterable[Row]:
         if log.address not in state.hash_by_address:
-            return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
+            return (
+                [state.failed_row_by_address[log.address]]
+                if log.address in state.failed_row_by_address
+                else []
+            )
         sha256 = state.hash_by_address[log.address]
         first_log = state.first_log_by_hash[sha256]
         if first_log is log and sha256 in rows_by_hash:
             return rows_by_hash[sha256]
-        status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}"
+        status, reason = NOT_COMPARED, f"the log is identical to {first_log.table_path}"
         if first_log is log:
             status = FAILED
             reason = "another run of px4fuse batch changed the results of this log"
@@ -294,11 +304,11 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
 
     def rows() -> Iterator[Row]:
         for log in logs:
-            common_columns = {"log": log.log, "name": log.name}
+            common_columns = {"log": log.table_path, "name": log.name}
             common_columns |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield with_log_path(row, log.log) | common_columns
+                yield with_log_path(row, log.table_path) | common_columns
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")

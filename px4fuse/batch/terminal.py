@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_from_table, sort_logs
+from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, logs_from_table, sort_logs
 from px4fuse.batch.rows import FAILED
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
-RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
-NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
+ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
+NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
@@ -32,8 +32,8 @@ def format_summary(batch_result: BatchResult) -> Page:
     for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
         if reason["count"] > 1:
-            template = f"{{count}} logs, for example {template}"
-        colour = RED if reason["status"] == FAILED else YELLOW
+            template = f"{{count}} logs without results, for example {template}"
+        colour = ERROR_COLOUR if reason["status"] == FAILED else WARNING_COLOUR
         page.write(template.format_map(reason).rstrip(), colour=colour)
     if (unlisted_count := len(reasons) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
@@ -58,7 +58,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     return page
 
 
-def _diagnosis_row(log: Log) -> tuple[Cell, ...]:
+def _diagnosis_row(log: LogSummary) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
     ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
     return (
@@ -92,7 +92,7 @@ def format_differences(results: ChangeResults) -> Page:
         ]
         rows.append((number.label, *cells, unit))
     if rows:
-        page.table(NUMBER_HEADS, rows, right_aligned_columns=(1, 2, 3, 4))
+        page.table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR
@@ -103,7 +103,7 @@ def format_differences(results: ChangeResults) -> Page:
         )
         page.write_labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.write_labelled("Worse", styled_text(text, 8.0, RED))
+        page.write_labelled("Worse", styled_text(text, 8.0, ERROR_COLOUR))
     if not results.worse:
         page.write("No verdict is worse in B than in A.")
     return page

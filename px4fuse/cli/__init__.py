@@ -14,12 +14,12 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.outputs import Interrupted, written_so_far
+from px4fuse.cli.outputs import Interrupted, written_files_sentence
 from px4fuse.core.input_files import inputs_protected
 from px4fuse.core.threads import ONE_THREAD
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
 
-# Names of the commands, in the order of --help: each one is function NAME in the module cli/NAME.py
+# Commands in the order of --help; each command NAME is the function NAME in cli/NAME.py
 COMMANDS = (
     "compare",
     "batch",
@@ -93,12 +93,12 @@ class LazyGroup(click.Group):
             error.args = (_with_option_names(str(error), ctx.invoked_subcommand or ""),)
             raise
         except BrokenPipeError as error:
-            # the new error has no errno, because click ends the command with exit code 1 for EPIPE
+            # without errno, because click handles EPIPE with exit code 1
             raise BrokenPipeError from error
         except KeyboardInterrupt as interrupt:  # click would print an empty line
-            raise Interrupted(interrupt, written_so_far(ctx)) from None
+            raise Interrupted(interrupt, written_files_sentence(ctx)) from None
         except (MemoryError, OSError) as error:
-            raise _make_system_error(error, written_so_far(ctx)) from error
+            raise _make_system_error(error, written_files_sentence(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -161,7 +161,7 @@ def _check_memory() -> None:
 
 
 def main() -> None:
-    """Run the command line; print an error as one line on standard error, with exit code 2."""
+    """Run the command line; print an error as one line on standard error, and exit with code 2."""
     # garbage collection takes 10 % of the run time of a short command, and 10 % more at exit
     gc.disable()
     atexit.register(gc.freeze)

@@ -18,7 +18,7 @@ FAIL_LEVELS = ("failed", *SEVERITIES)
 @options.output_option(
     "DIR", "Output folder for the table and the results of each log.", required=True
 )
-@options.flag("--reports", help="Also write a PDF report for each log.")
+@options.flag_option("--reports", help="Also write a PDF report for each log.")
 @options.timeout_option
 @options.count_option(
     "--workers",
@@ -60,11 +60,15 @@ def batch(
     gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:
         with outputs.progress() as show_progress:
-            fleet = run(logs, output, scheduler=scheduler, progress=show_progress, **option_values)
+            batch_result = run(
+                logs, output, scheduler=scheduler, progress=show_progress, **option_values
+            )
     except KeyboardInterrupt as interrupt:
         message = "no log was finished, and nothing was written."
         if (output / "rows").is_dir():
             message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
-    outputs.write_and_print({}, format_summary(fleet), written_files=fleet.written)
-    options.exit_for_severity(fail_on, FAIL_LEVELS, {*fleet.severities, *fleet.table["status"]})
+    outputs.write_and_print({}, format_summary(batch_result), written_files=batch_result.written)
+    options.exit_for_severity(
+        fail_on, FAIL_LEVELS, {*batch_result.severities, *batch_result.table["status"]}
+    )

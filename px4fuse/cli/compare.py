@@ -21,13 +21,15 @@ from px4fuse.request import settings_name
     "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )
 @options.fail_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
-@options.flag(
+@options.flag_option(
     "--checks",
     help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
     "long time.",
 )
-@options.flag("-v", "--verbose", help="Print all findings, axes and KF settings on the terminal.")
-@options.flag("-q", "--quiet", help="Print the diagnosis on one line only.")
+@options.flag_option(
+    "-v", "--verbose", help="Print all findings, axes and KF settings on the terminal."
+)
+@options.flag_option("-q", "--quiet", help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
     log: Path,

@@ -67,7 +67,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
     "Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
     "[default: auto if the two trajectories do not overlap in time, else 0]",
 )
-@options.flag(
+@options.flag_option(
     "--consecutive",
     help="Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
 )

@@ -11,7 +11,7 @@ from px4fuse.cli.options import (
     InputPath,
     NonEmptyPath,
     count_option,
-    flag,
+    flag_option,
     input_option,
     max_size_option,
     open_option,
@@ -85,7 +85,7 @@ from px4fuse.errors import OutputError, SettingsError
     help="Write questions.txt: N questions to each student for an oral check, from the student's "
     "own form and flight, with the expected answers. Requires --key.",
 )
-@flag("--include-pending", help="Count points that the instructor has not confirmed yet.")
+@flag_option("--include-pending", help="Count points that the instructor has not confirmed yet.")
 @input_option(
     "--worksheet",
     "FILE.csv",
@@ -96,7 +96,7 @@ from px4fuse.errors import OutputError, SettingsError
 @click.option(
     "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."
 )
-@flag(
+@flag_option(
     "--anonymous",
     help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
 )
@@ -123,7 +123,6 @@ def grade(
     roster: Path | None,
     due: str | None,
     late: str | None,
-    jobs: int | None,
     write_rubric: Path | None,
     **option_values: Any,
 ) -> None:
@@ -147,7 +146,7 @@ def grade(
         return
     if late and due is None:
         raise SettingsError("--late requires --due TIME.")
-    question_count = option_values.pop("questions") or 0
+    question_count, process_count = option_values.pop("questions") or 0, option_values.pop("jobs")
     if question_count and key is None:
         raise SettingsError("--questions requires --key FILE.json.")
     if not submissions:
@@ -175,7 +174,7 @@ def grade(
                 submissions,
                 course,
                 output,
-                processes=jobs,
+                processes=process_count,
                 progress=partial(show_progress, "grading"),
             )
     except KeyboardInterrupt as interrupt:

@@ -5,7 +5,13 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import comparison_request, flag, flight_options, json_option, log_argument
+from px4fuse.cli.options import (
+    comparison_request,
+    flag_option,
+    flight_options,
+    json_option,
+    log_argument,
+)
 from px4fuse.cli.outputs import progress, result_files, write_and_print
 
 
@@ -25,7 +31,7 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
 
 @click.command()
 @log_argument
-@flag(
+@flag_option(
     "--versions",
     is_eager=True,
     expose_value=False,

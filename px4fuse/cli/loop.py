@@ -63,7 +63,7 @@ _loop_option = partial(options.request_option, LoopRequest)
     "nose at take-off) and to the right (m), and the clockwise rotation (°) if known.  [default: "
     "the ground truth of the log, else 0,0]",
 )
-@options.flag(
+@options.flag_option(
     "--open",
     "opened",
     help="Do not use the landing as a loop closure, because the vehicle did not return to the "
@@ -78,7 +78,7 @@ _loop_option = partial(options.request_option, LoopRequest)
     help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s), within SIGMA "
     "(m, 1 σ); repeatable.  [default SIGMA: 0.1 m]",
 )
-@options.flag(
+@options.flag_option(
     "--robust",
     help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
     "which takes minutes.",
@@ -176,7 +176,7 @@ def loop(
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """Make the request of a loop analysis from the values of the command's options."""
+    """Convert the values of the options to the settings of a loop analysis."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("opened"), **option_values

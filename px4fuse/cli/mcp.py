@@ -26,7 +26,7 @@ from px4fuse.core.reading import (
 from px4fuse.errors import SettingsError
 
 # Name of the argument of a tool, by the name of the command's parameter if the names differ
-ARGUMENT_NAMES = {"finding": "finding_id", "changes": "parameters", "source": "log"}
+ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
 # Parameters of commands that tools do not have: outputs, exit codes and student
 HIDDEN_PARAMETERS = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
@@ -99,7 +99,7 @@ def run_command(
     out : Path or None
         Current folder of the command, in which it writes reports.
     sender : Connection or None
-        Connection to which the activities of the command are sent.
+        Connection to which progress messages are sent.
     words : sequence of str
         Command line, without ``px4fuse``.
     """
@@ -135,7 +135,6 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
     from px4fuse.card.model import Card
     from px4fuse.results import contract
 
-    # command and type of the results by name of the tool
     command_and_type_by_tool: dict[str, tuple[str, type | UnionType | None]] = {
         "info": ("info", dict),
         "diagnose": ("compare", Card),
@@ -165,7 +164,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
-    """Return the parameters of a command that are arguments of its tool, by argument name."""
+    """Return the parameters of a command by the names of its tool's arguments."""
     return {
         ARGUMENT_NAMES.get(name, name): parameter
         for parameter in find_command(command_name).params

@@ -74,8 +74,8 @@ class InputPath(NonEmptyPath):
 class TypedQuantity(click.ParamType["float | str"]):
     """Option type of a number in a fixed unit of :data:`px4fuse.core.units.UNIT_NAMES`.
 
-    The error for a text that is not a number suggests ``example``. If ``auto`` is True, the text
-    "auto" is also accepted.
+    ``example`` is a valid value for the error message. If ``auto`` is True, the text "auto" is also
+    accepted.
     """
 
     name = "number"
@@ -84,7 +84,7 @@ class TypedQuantity(click.ParamType["float | str"]):
         self.unit, self.example, self.auto = unit, example, auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """Return the unit in capital letters, which --help prints for the value of the option."""
+        """Return the unit in capital letters, as --help shows the value of the option."""
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
@@ -133,7 +133,7 @@ memory_option = click.option(
     default=4.0,
     help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
 )
-# The size limit of logs is not part of a request, because it does not affect results
+# Not a field of the recorded settings, because the size limit does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
@@ -159,42 +159,44 @@ def _json_option(more_text: str = "") -> Option:
 json_option = _json_option()
 
 
-flag = partial(click.option, is_flag=True)
+flag_option = partial(click.option, is_flag=True)
 
 
 def count_option(name: str, low: int, high: int, **details: Any) -> Option:
     return click.option(name, type=click.IntRange(low, high), metavar="N", **details)
 
 
-def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
-    return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
+def input_option(name: str, metavar: str, help_text: str, **details: Any) -> Option:
+    return click.option(name, type=InputPath(), metavar=metavar, help=help_text, **details)
 
 
-def output_option(metavar: str, text: str, **details: Any) -> Option:
+def output_option(metavar: str, help_text: str, **details: Any) -> Option:
     """Declare -o for an output file or folder; ``details`` are arguments of ``click.option``."""
     return click.option(
-        "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
+        "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=help_text, **details
     )
 
 
-def report_options(text: str) -> Option:
+def report_options(help_text: str) -> Option:
     """Declare -o for the PDF report and --json for its results."""
     json_text = " With --json and without -o, no report is written.  [default: beside the report]"
-    return _combine_options(output_option("FILE.pdf", text), _json_option(json_text))
+    return _combine_options(output_option("FILE.pdf", help_text), _json_option(json_text))
 
 
-def fail_option(levels: tuple[str, ...], text: str) -> Option:
-    return click.option("--fail-on", type=Choice(levels), help=text)
+def fail_option(levels: tuple[str, ...], help_text: str) -> Option:
+    return click.option("--fail-on", type=Choice(levels), help=help_text)
 
 
-def exit_for_severity(fail_on: str | None, levels: Sequence[str], reached: Iterable[str]) -> None:
+def exit_for_severity(
+    fail_on: str | None, levels: Sequence[str], reached_levels: Iterable[str]
+) -> None:
     """Exit with code 1 if the level of --fail-on or a more severe level is reached."""
-    if fail_on is not None and {*reached}.intersection(levels[: levels.index(fail_on) + 1]):
+    if fail_on is not None and {*reached_levels} & {*levels[: levels.index(fail_on) + 1]}:
         sys.exit(1)
 
 
 def _open_flag(*names: str) -> Option:
-    return flag(
+    return flag_option(
         *names,
         expose_value=False,
         callback=lambda ctx, _, value: ctx.meta.update({OPENS_OUTPUT_KEY: value}),
@@ -204,7 +206,7 @@ def _open_flag(*names: str) -> Option:
 
 #: Option --open of commands that write a report or a page
 open_option = _open_flag("--open", "--show", "opened")
-#: Option --show of px4fuse loop, whose option --open declares a flight that is not a loop
+#: Option --show of px4fuse loop, where --open has another meaning
 show_option = _open_flag("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(
@@ -228,12 +230,12 @@ system_option = click.option(
 
 
 def request_option(
-    request_type: type[Struct], name: str, text: str, example: float = 0.1, **details: Any
+    request_type: type[Struct], name: str, help_text: str, example: float = 0.1, **details: Any
 ) -> Option:
-    """Declare the option of a field of a request, with the type, unit and default of the field.
+    """Declare the option for a field of ``request_type``, with its type, unit and default.
 
-    RANGE in the help text stands for the range of a KF setting. ``example`` is the number that the
-    error for another text suggests. ``details`` are arguments of ``click.option``.
+    RANGE in ``help_text`` is replaced by the range of the KF setting. ``example`` is a valid value
+    for the error message. ``details`` are arguments of ``click.option``.
     """
     field = next(field for field in structs.fields(request_type) if field.name == name)
     types = (field.type, *get_args(field.type))
@@ -246,10 +248,11 @@ def request_option(
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
-        text = text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
-    # the parameter of an option for a position file has the name of the option
+        range_text = "{:g} to {:g} {}".format(*SETTING_RANGES[name])
+        help_text = help_text.replace("RANGE", range_text)
+    # for a position file, click derives the parameter name from the option (position_frame)
     names = () if request_type is PositionFile else (name,)
-    return click.option(OPTION_NAMES[request_type][name], *names, help=text, **details)
+    return click.option(OPTION_NAMES[request_type][name], *names, help=help_text, **details)
 
 
 _comparison_option = partial(request_option, ComparisonRequest)
@@ -330,13 +333,13 @@ filter_options = _combine_options(
     _comparison_option(
         "position_source",
         "Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
-        "sources.  [default: the logged source with the fewest processing steps]",
+        "sources.  [default: the logged source closest to the raw measurement]",
         metavar="NAME",
     ),
     _comparison_option(
         "source_kind",
-        "Kind of the position source; only vio may drift.  [default: from the messages; vio if "
-        "they contain a changing orientation]",
+        "Kind of the position source; vio drifts, the other kinds do not.  [default: from the "
+        "messages; vio if their orientation changes]",
     ),
     _comparison_option(
         "height",
@@ -353,7 +356,7 @@ settings_options = _combine_options(filter_options, system_option, _clock_option
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
-    """Make a request from the values of ``flight_options`` or ``analysis_options``.
+    """Convert the values of options to the settings of ``px4fuse compare``.
 
     Raises
     ------
@@ -377,7 +380,7 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """Yield the options and arguments that the user typed, without those at their defaults."""
+    """Yield the options and arguments that the user typed."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
@@ -385,7 +388,7 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any], log: Path) -> Student:
-    """Take the values of ``student_options`` out of the option values, and read their files.
+    """Remove the values of ``student_options`` from the option values, and read their files.
 
     Raises
     ------

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
-# longer name is cut
+# Maximum length (bytes) of a default report name (file systems allow 255), and length of the part
+# that is kept of a longer name
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
-# Name and id of the student in a report without a student
+# Name and id in a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
@@ -38,7 +38,7 @@ UNWRAPPED_WIDTH = 10_000
 WRITTEN_KEY = "px4fuse.written"
 # Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
-# Key in the context of click for the function that sends the activity of a run to px4fuse mcp
+# Key in the context of click for the function that reports progress to px4fuse mcp
 SEND_KEY = "px4fuse.send"
 # Key in the context of click for the list of results (JSON text) that px4fuse mcp returns
 RESULTS_KEY = "px4fuse.results"
@@ -71,7 +71,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
     Raises
     ------
     OutputError
-        A target is not possible, see :func:`check_targets`.
+        A target cannot be written, see :func:`check_targets`.
     """
     check_targets(targets)
     context = click.get_current_context(silent=True)
@@ -113,7 +113,7 @@ def default_report(name: str, results: Results) -> Path:
     Raises
     ------
     OutputError
-        A file with this path exists and is not a report on the same input files and student.
+        The path is a file that is not a report for the same input files and student.
     """
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
@@ -122,9 +122,11 @@ def default_report(name: str, results: Results) -> Path:
         short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
-    fault = "the file is not a report of this px4fuse version on the same input files and student"
+    mismatch_reason = (
+        "the file is not a report of this px4fuse version for the same input files and student"
+    )
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
-        _check_default(target, fault, partial(_is_same_report, results, read))
+        _check_default(target, mismatch_reason, partial(_is_same_report, results, read))
     return path
 
 
@@ -134,37 +136,41 @@ def check_default_page(path: Path, page: str) -> None:
     Raises
     ------
     OutputError
-        A file with this path exists and is not a web page of the same command and log.
+        The path is a file that is not a web page of the same command and log.
     """
     generator = GENERATOR.findall(page)
-    fault = "the file is not a page of this px4fuse version with the same command and log"
-    _check_default(path, fault, lambda content: GENERATOR.findall(content.decode()) == generator)
+    _check_default(
+        path,
+        "the file is not a page of this px4fuse version for the same command and log",
+        lambda content: GENERATOR.findall(content.decode()) == generator,
+    )
 
 
-def _check_default(path: Path, fault: str, is_replaceable: Callable[[bytes], bool]) -> None:
+def _check_default(
+    path: Path, mismatch_reason: str, is_replaceable: Callable[[bytes], bool]
+) -> None:
     try:
         may_replace = not path.exists() or is_replaceable(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
         may_replace = False
     if not may_replace:
         raise OutputError(
-            f"{path} exists and was not overwritten, because {fault}",
+            f"{path} exists and was not overwritten, because {mismatch_reason}",
             "Choose another name with -o.",
         )
 
 
 def _is_same_report(
-    results: Results, read: Callable[[bytes, str], Results], content: bytes
+    new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True if an existing report is on the same input files, and not of another student."""
+    """Return True if an existing report has the same input files, and no other student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
-    existing_results = read(content, "report")
-    same_files = file_hashes_in(to_json(existing_results)) == file_hashes_in(to_json(results))
-    return same_files and _student_name_and_id(existing_results) in (
-        NO_STUDENT_NAME,
-        _student_name_and_id(results),
-    )
+    existing_results = read(existing_content, "report")
+    existing_hashes = file_hashes_in(to_json(existing_results))
+    return existing_hashes == file_hashes_in(to_json(new_results)) and _student_name_and_id(
+        existing_results
+    ) in (NO_STUDENT_NAME, _student_name_and_id(new_results))
 
 
 def _student_name_and_id(results: Results) -> tuple[str, str]:
@@ -178,7 +184,7 @@ def web_page(output: Path | None, default: Path) -> Path:
     Raises
     ------
     OutputError
-        The name does not end in .html or .htm, or the path is not possible.
+        The name does not end in .html or .htm, or the path cannot be written.
     """
     target = output or default
     if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
@@ -195,7 +201,7 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     Raises
     ------
     OutputError
-        The name of the report does not end in .pdf, or a path is not possible.
+        The name of the report does not end in .pdf, or a path cannot be written.
     """
     if output is not None and output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the output is a PDF. Give a name ending in .pdf (-o).")
@@ -217,7 +223,7 @@ def result_files(
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by their paths.
 
-    Without --json and -o, the report has the ``default_name``; without this name, none is made.
+    Without --json and -o, the report has the ``default_name``; if it is empty, no report is made.
     """
     from px4fuse.results.contract import to_json
 
@@ -244,14 +250,14 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     Raises
     ------
     OutputError
-        A path is not possible, or an output cannot be written.
+        An output cannot be written.
     """
     check_targets(contents)
     written_files: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
     write_all(contents, written_files.append)
 
 
-def written_so_far(context: click.Context) -> str:
+def written_files_sentence(context: click.Context) -> str:
     written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
@@ -276,7 +282,7 @@ def check_targets(targets: Iterable[Path | None]) -> None:
     ------
     OutputError
         Two outputs are the same file, an output is a folder or an input of this command, or a path
-        is not possible.
+        cannot be written.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
@@ -300,7 +306,9 @@ def write_and_print(
     request: Request | None = None,
     written_files: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs, print the results and the file names, and open one file for --open.
+    """Write all outputs, and print the results and the file names.
+
+    With --open, open the file whose suffix is first in OPENABLE_SUFFIXES.
 
     Parameters
     ----------
@@ -309,7 +317,7 @@ def write_and_print(
     page : Page, optional
         Results to print.
     request : Request, optional
-        Request with the files and options that printed commands contain.
+        Settings from which printed commands take their files and options.
     written_files : iterable of Path
         Files that the command has already written.
     """
@@ -337,7 +345,7 @@ def show_page(page: Page, *, is_error: bool = False) -> None:
 
 
 def terminal(*, is_error: bool = False) -> Console:
-    """Return a console; it raises BrokenPipeError if the reader of standard output has ended.
+    """Return a console that raises BrokenPipeError if the reader of standard output has ended.
 
     In a pipe, a paragraph is one line unless the environment variable COLUMNS contains a width.
     """

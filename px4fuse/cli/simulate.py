@@ -11,7 +11,7 @@ from px4fuse.cli.options import (
     Choice,
     NonEmptyPath,
     TypedQuantity,
-    flag,
+    flag_option,
     input_option,
     output_option,
     typed_parameters,
@@ -48,16 +48,18 @@ MAX_SECRET_BYTES = 10_000
 
 
 def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add an option for each number of a scenario, with default and help of the field."""
+    """Add an option for each numeric field of Scenario, with its default and meaning."""
     for field, quantity in reversed(bounds_by_field(Scenario).items()):
         if not quantity.meaning:
             continue
         default = getattr(_DEFAULT_SCENARIO, field)
-        outdoors = DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field)
-        default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
+        outdoor_default = DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field)
+        default_text = f"{default:g}" + (
+            f"; outdoors {outdoor_default:g}" if outdoor_default else ""
+        )
         help_text = f"{quantity.meaning}  [default: {default_text}]"
-        kind = TypedQuantity(quantity.unit, default)
-        command = click.option(quantity.cli_name, field, type=kind, help=help_text)(command)
+        option_type = TypedQuantity(quantity.unit, default)
+        command = click.option(quantity.cli_name, field, type=option_type, help=help_text)(command)
     return command
 
 
@@ -129,8 +131,8 @@ class CommandWithFaultTable(click.Command):
     help="Answer key to write: injected faults, biases, outliers and clock offset; not for "
     "students.  [default with --assignment: DIR_answers.json]",
 )
-@flag("--no-truth", help="Write no ground truth to the log.")
-@flag("--no-ekf2", help="Do not simulate EKF2, to save time.")
+@flag_option("--no-truth", help="Write no ground truth to the log.")
+@flag_option("--no-ekf2", help="Do not simulate EKF2, to save time.")
 @click.option(
     "--passes",
     type=int,
@@ -238,9 +240,9 @@ def _write_assignment(
     folder: Path,
     answer_path: Path | None,
     secret: bytes | None,
-    kind: Any,
-    count: int | None,
-    truth: bool,
+    scenario_kind: Any,
+    fault_count: int | None,
+    has_truth: bool,
 ) -> None:
     """Write one flight per student and the answer key."""
     from px4fuse.classroom.assignment import assignment
@@ -248,12 +250,18 @@ def _write_assignment(
     from px4fuse.classroom.terminal import assignment_page
 
     students = read_roster(roster)
-    key_file = assignment.key_path(folder, answer_path)
-    check_targets([key_file])
+    answer_key_path = assignment.key_path(folder, answer_path)
+    check_targets([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:
-        show_flight = partial(show_progress, "simulating")
         key, written_files = assignment.assign(
-            students, folder, key_file, secret, kind, count, truth, show_flight
+            students,
+            folder,
+            answer_key_path,
+            secret,
+            scenario_kind,
+            fault_count,
+            has_truth,
+            partial(show_progress, "simulating"),
         )
-    write_and_print({}, assignment_page(key, folder, key_file, written_files))
+    write_and_print({}, assignment_page(key, folder, answer_key_path, written_files))

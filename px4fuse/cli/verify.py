@@ -50,12 +50,14 @@ def verify(
         if logs and not files:
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
-        verdict = run_one_with_limits(
+        verification = run_one_with_limits(
             partial(verify_report, pdf=content, logs=files), recorded_results, TIMEOUT_S
         )
-    if isinstance(verdict, JobFailure):
-        raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
-    report_files = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
-    contents = report_files | result_files(verdict_data(content, verdict), json_path)
-    write_and_print(contents, verdict_page(display_name(report), verdict, output))
-    sys.exit(0 if verdict.outcome == "verified" else 1)
+    if isinstance(verification, JobFailure):
+        raise LogError(f"{display_name(report)}: cannot be verified: {verification.reason}")
+    report_files = (
+        {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
+    )
+    contents = report_files | result_files(verdict_data(content, verification), json_path)
+    write_and_print(contents, verdict_page(display_name(report), verification, output))
+    sys.exit(0 if verification.outcome == "verified" else 1)

@@ -15,7 +15,7 @@ from px4fuse.request import Sweep, WhatIfRequest
 @options.log_argument
 @click.option(
     "--set",
-    "changes",
+    "parameter_texts",
     metavar="NAME=VALUE",
     multiple=True,
     help="EKF2 parameter and its value in the replay, in PX4's unit; repeatable.  [default: the "
@@ -47,7 +47,7 @@ from px4fuse.request import Sweep, WhatIfRequest
 @options.json_option
 def whatif(
     log: Path,
-    changes: tuple[str, ...],
+    parameter_texts: tuple[str, ...],
     sweep: str | None,
     without: tuple[str, ...],
     start_s: float | None,
@@ -71,7 +71,7 @@ def whatif(
         raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(
         log=str(log),
-        changes=_parse_changes(changes),
+        changes=_parse_parameters(parameter_texts),
         sweep=None if sweep is None else _parse_sweep(sweep),
         without=dict.fromkeys(without, start_s or 0.0),
         **option_values,
@@ -82,18 +82,18 @@ def whatif(
     outputs.write_and_print(outputs.result_files(results, json_path), summary(analysis))
 
 
-def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
-    changes: dict[str, float] = {}
-    for text in texts:
+def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:
+    value_by_name: dict[str, float] = {}
+    for text in parameter_texts:
         name, separator, value = text.partition("=")
         if not separator:
             raise SettingsError(
                 f"--set {text} is not NAME=VALUE. Give for example --set EKF2_EVP_NOISE=0.1."
             )
-        if name in changes:
+        if name in value_by_name:
             raise SettingsError(f"--set {name} is given twice. Give each parameter once.")
-        changes[name] = _parse_number(f"--set {text}", name, value)
-    return changes
+        value_by_name[name] = _parse_number(f"--set {text}", name, value)
+    return value_by_name
 
 
 def _parse_sweep(text: str) -> Sweep:

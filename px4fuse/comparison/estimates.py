@@ -221,12 +221,12 @@ def _fit_source_errors(
         return horizontal, horizontal, horizontal
     flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, horizontal
     offset_s = 0.0
-    if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        offset_s = (
-            clock_offset.remaining_s
-            if abs(clock_offset.remaining_s) > clock_offset.three_sigma_s
-            else 0.0
-        )
+    if (
+        isinstance(clock_offset, ClockOffset)
+        and clock_offset.is_determinable
+        and abs(clock_offset.remaining_s) > clock_offset.three_sigma_s
+    ):
+        offset_s = clock_offset.remaining_s
     systematic_errors = fit_systematic_errors(
         flight,
         axes,

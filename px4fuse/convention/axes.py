@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from px4fuse.convention.model import Axes, Direction, HeadingSource, Unit
-from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
+from px4fuse.convention.motion import DIFFERENCE_WINDOW_S, GRID_INTERVAL_S, ImuMotion, SourceMotion
 from px4fuse.core.arrays import Array, IntArray
 
 # Maximum tested time offset (s) of the positions
@@ -32,7 +32,7 @@ MIN_SIGMA_DOWN_M = 0.08
 DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
 UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Maximum rotation (rad) of the frame about the vertical that is a misalignment
+# Rotations (rad) of the frame about the vertical up to this angle are a misalignment
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
@@ -76,8 +76,8 @@ AXES_ODDS: Final[dict[Axes, float]] = {
 }
 
 
-class Family(NamedTuple):
-    """Assignment of x, y, z to a vertical axis and two horizontal axes, before the rotation.
+class AxisAssignment(NamedTuple):
+    """Assignment of x, y, z to a vertical axis and two horizontal axes; rotation is separate.
 
     Attributes
     ----------
@@ -99,21 +99,21 @@ class Family(NamedTuple):
     def is_mirrored(self) -> bool:
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
-    def axes(self, quarter: int) -> Axes:
-        """Return the directions of x, y, z with ``axis_a`` at ``quarter`` · 90° from north."""
+    def axes(self, quarter_turns: int) -> Axes:
+        """Return the directions of x, y, z with ``axis_a`` at ``quarter_turns`` from north."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        directions[self.axis_a] = CLOCKWISE[quarter % 4]
-        directions[self.axis_b] = CLOCKWISE[(quarter + self.handedness) % 4]
+        directions[self.axis_a] = CLOCKWISE[quarter_turns % 4]
+        directions[self.axis_b] = CLOCKWISE[(quarter_turns + self.handedness) % 4]
         return directions[0], directions[1], directions[2]
 
-    def log_odds(self, quarter: int) -> float:
-        axes = self.axes(quarter)
+    def log_odds(self, quarter_turns: int) -> float:
+        axes = self.axes(quarter_turns)
         other_axes_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
         return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_odds)
 
 
-FAMILIES = tuple(
-    Family(vertical, sign, 0 if vertical else 1, 1 if vertical == 2 else 2, hand)
+AXIS_ASSIGNMENTS = tuple(
+    AxisAssignment(vertical, sign, 0 if vertical else 1, 1 if vertical == 2 else 2, hand)
     for vertical, sign, hand in product(range(3), (1, -1), (1, -1))
 )
 
@@ -132,8 +132,10 @@ class SentPositions:
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
-        margin_steps = round(self.max_offset_s / GRID_S)
-        grid_s = imu.time_s[0] + GRID_S * np.arange(-margin_steps, len(imu.time_s) + margin_steps)
+        margin_steps = round(self.max_offset_s / GRID_INTERVAL_S)
+        grid_s = imu.time_s[0] + GRID_INTERVAL_S * np.arange(
+            -margin_steps, len(imu.time_s) + margin_steps
+        )
         return SourceMotion.of(self.time_s, self.position_m, grid_s)
 
 
@@ -150,23 +152,23 @@ class Hypothesis:
         Log likelihood plus log prior odds.
     has_rotation : bool
         False if the rotation is fixed to a multiple of 90°.
-    scale, max_scale : float
-        Bounds of the ratio of the source's distances to those of the IMU.
-    sigma_m : float
-        Scale (m) of the horizontal residuals.
+    min_scale, max_scale : float
+        Bounds of the scale factor of the positions, relative to the displacement from the IMU.
+    residual_sigma_m : float
+        Scale (m) of the Student distribution of the horizontal residuals.
     independent_count : float
         Number of independent residuals.
     """
 
-    family: Family
+    assignment: AxisAssignment
     unit: Unit
     parameters: Array
     score: float
     has_rotation: bool = True
     has_clock_drift: bool = False
-    scale: float = 1.0
+    min_scale: float = 1.0
     max_scale: float = 1.0
-    sigma_m: float = 0.0
+    residual_sigma_m: float = 0.0
     independent_count: float = 0.0
     heading_from: HeadingSource = "EKF2"
 
@@ -176,24 +178,24 @@ class Hypothesis:
         return float(self.parameters[0])
 
     @property
-    def quarter(self) -> int:
-        """Rotation from north, in quarter turns (rounded)."""
+    def quarter_turns(self) -> int:
+        """Rotation of ``axis_a`` from north, in quarter turns (rounded)."""
         return round(float(self.parameters[1]) / (np.pi / 2.0))
 
     @property
     def axes(self) -> Axes:
         """Directions of x, y, z, to the nearest quarter turn."""
-        return self.family.axes(self.quarter)
+        return self.assignment.axes(self.quarter_turns)
 
     @property
     def remainder_rad(self) -> float:
         """Rotation (rad) minus the quarter turns."""
-        return float(self.parameters[1] - self.quarter * np.pi / 2.0)
+        return float(self.parameters[1] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
         turn_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
         is_similar = abs(self.offset_s - other.offset_s) < 0.5 and abs(turn_rad) < max_turn_rad
-        return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
+        return bool(is_similar and (self.assignment, self.unit) == (other.assignment, other.unit))
 
 
 def without_clock_drift(time_s: Array, drift: float) -> Array:
@@ -247,17 +249,18 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     moments = np.stack(
         [source_columns[step : step + len(imu_columns)].T @ imu_columns for step in offset_steps]
     )
-    # sums of products at each time offset; index 6 is a column of ones
-    has_overlap = moments[:, 6, 6] * GRID_S >= MIN_OVERLAP_S
+    # sums of products of source and IMU columns at each time offset. Column 6 is 1 for a valid
+    # sample, so [6, 6] is the number of samples
+    has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
     offset_s, moments = (
-        (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_S,
+        (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S,
         moments[has_overlap],
     )
-    independent_count = moments[:, 6, 6, None, None] * (GRID_S / WINDOW_S)
+    independent_count = moments[:, 6, 6, None, None] * (GRID_INTERVAL_S / DIFFERENCE_WINDOW_S)
     moments /= moments[:, 6:, 6:]
-    vertical_axis, vertical_sign, axis_a, axis_b, handedness = np.array(FAMILIES).T
+    vertical_axis, vertical_sign, axis_a, axis_b, handedness = np.array(AXIS_ASSIGNMENTS).T
     correlation = (
         moments[:, axis_a, 0] + handedness * moments[:, axis_b, 1] + 1j * moments[:, axis_a, 1]
     )
@@ -281,23 +284,28 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
     score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
     rotation_angle = np.angle(correlation)
-    nearest_quarter = np.round(rotation_angle / (np.pi / 2.0)).astype(int) % 4
+    nearest_quarter_turns = np.round(rotation_angle / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
-    for quarter in range(4):
-        score_of_quarter = np.where((nearest_quarter == quarter)[..., None], score, -np.inf)
-        for (family_index, unit_index), offset_index in np.ndenumerate(
-            np.argmax(score_of_quarter, axis=0)
+    for quarter_turns in range(4):
+        scores_at_quarter = np.where(
+            (nearest_quarter_turns == quarter_turns)[..., None], score, -np.inf
+        )
+        for (assignment_index, unit_index), offset_index in np.ndenumerate(
+            np.argmax(scores_at_quarter, axis=0)
         ):
-            unit_name, family = [*UNITS][unit_index], FAMILIES[family_index]
+            unit_name, assignment = [*UNITS][unit_index], AXIS_ASSIGNMENTS[assignment_index]
+            # without heights, only the third axis can be vertical
+            if assignment.vertical_axis != 2 and not source_motion.table[:, 2].any():
+                continue
             total_score = (
-                score_of_quarter[offset_index, family_index, unit_index]
-                + family.log_odds(quarter)
+                scores_at_quarter[offset_index, assignment_index, unit_index]
+                + assignment.log_odds(quarter_turns)
                 + UNIT_ODDS * (unit_name != "m")
             )
             parameters = np.array(
-                [offset_s[offset_index], rotation_angle[offset_index, family_index], *[0.0] * 5]
+                [offset_s[offset_index], rotation_angle[offset_index, assignment_index], *[0.0] * 5]
             )
-            hypotheses.append(Hypothesis(family, unit_name, parameters, float(total_score)))
+            hypotheses.append(Hypothesis(assignment, unit_name, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -329,17 +337,18 @@ def _evaluate_hypothesis(
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
     offset_s, rotation_angle, heading_drift, clock_drift = hypothesis.parameters[:4]
     accelerometer_bias, time_s = hypothesis.parameters[4:], source_motion.time_s[rows]
-    row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
+    row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
+    middle_s = float(np.mean(time_s))
     grid_position = time_s - offset_s - clock_drift * (time_s - middle_s)
-    grid_position = (grid_position - imu_motion.time_s[0]) / GRID_S
+    grid_position = (grid_position - imu_motion.time_s[0]) / GRID_INTERVAL_S
     grid_index = np.clip(np.floor(grid_position).astype(int), 0, len(imu_motion.time_s) - 2)
     is_used = (
         (grid_position >= 0)
         & (grid_position < len(imu_motion.time_s) - 1)
         & imu_motion.is_valid[grid_index]
     )
-    independent_count = float(np.count_nonzero(is_used)) * row_s / WINDOW_S
-    if independent_count * WINDOW_S < MIN_OVERLAP_S:
+    independent_count = float(np.count_nonzero(is_used)) * row_interval_s / DIFFERENCE_WINDOW_S
+    if independent_count * DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
@@ -349,7 +358,7 @@ def _evaluate_hypothesis(
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     sent_differences, (vertical_axis, vertical_sign, axis_a, axis_b, handedness) = (
         source_motion.table[rows[is_used]],
-        hypothesis.family,
+        hypothesis.assignment,
     )
     unit_m = UNITS[hypothesis.unit]
     complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * elapsed_s))
@@ -367,18 +376,17 @@ def _evaluate_hypothesis(
     residual = source_ned_m - imu_ned_m
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
-    down_gain, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
-    is_known = sent_differences.any(axis=0)  # False for the height if the source has none
-    log_likelihood_gain += down_gain * is_known[vertical_axis] + np.log(unit_m) * np.count_nonzero(
-        is_known
-    )
+    vertical_log_likelihood, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
+    is_axis_known = sent_differences.any(axis=0)  # False for the height if the source has none
+    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis]
+    log_likelihood_gain += np.log(unit_m) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
-        student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_known]
+        student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_axis_known]
     )
     weight = 1.0 / (
         np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / DEGREES_OF_FREEDOM
     )
-    weight *= row_s / WINDOW_S
+    weight *= row_interval_s / DIFFERENCE_WINDOW_S
     ned_square, source_imu_product, imu_square = (
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in (
@@ -396,9 +404,9 @@ def _evaluate_hypothesis(
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = imu_table[..., 1:]
-    is_drifting = hypothesis.heading_from != "EKF2"
+    uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_free = np.array(
-        [True, hypothesis.has_rotation, is_drifting, hypothesis.has_clock_drift, *[True] * 3]
+        [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
     weights, columns = (
         weight[[0, 0, 1]].T.ravel(),
@@ -418,9 +426,9 @@ def _evaluate_hypothesis(
             independent_count * log_likelihood_gain
             - 0.5 * PARAMETER_PRECISION @ hypothesis.parameters**2
         ),
-        scale=source_imu_product / imu_square,
+        min_scale=source_imu_product / imu_square,
         max_scale=ned_square / source_imu_product,
-        sigma_m=sigma_m,
+        residual_sigma_m=sigma_m,
         independent_count=independent_count,
     )
     return scored_hypothesis, parameter_step
@@ -441,7 +449,8 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the log prior odds of a hypothesis, plus the log likelihood ratio of its heights."""
-    log_odds = hypothesis.family.log_odds(hypothesis.quarter) + UNIT_ODDS * (hypothesis.unit != "m")
+    log_odds = hypothesis.assignment.log_odds(hypothesis.quarter_turns)
+    log_odds += UNIT_ODDS * (hypothesis.unit != "m")
     log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
@@ -456,12 +465,12 @@ def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
 def _height_log_likelihood(
     hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_m: Array
 ) -> float:
-    """Return the log likelihood of the barometer heights, relative to a constant height."""
+    """Return the log likelihood ratio of the barometer heights: sent heights against a constant."""
     height_m = np.interp(positions.time_s - hypothesis.offset_s, time_s, barometer_m)
     down_m = (
         UNITS[hypothesis.unit]
-        * hypothesis.family.vertical_sign
-        * positions.position_m[:, hypothesis.family.vertical_axis]
+        * hypothesis.assignment.vertical_sign
+        * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )
     # the height is positive upwards, so its sum with the vertical position is constant
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)

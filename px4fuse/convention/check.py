@@ -1,4 +1,4 @@
-"""Decision on the convention of a position source, before other estimates use the source."""
+"""Determination of the axes, unit, clock and orientation that a position source uses."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from px4fuse.convention.model import (
     Verdict,
 )
 from px4fuse.convention.motion import (
-    WINDOW_S,
+    DIFFERENCE_WINDOW_S,
     ImuMotion,
     Inertial,
     motion_from_imu,
@@ -38,24 +38,26 @@ from px4fuse.trajectory.rotation import heading
 MIN_LOG_ODDS = 4.0
 # Minimum log-likelihood gain of a convention over positions unrelated to the motion
 MIN_LIKELIHOOD_GAIN = 8.0
-# Minimum log-likelihood gain per independent sample: unambiguous, ambiguous convention
+# Minimum log-likelihood gain per independent sample: of an unambiguous convention, and of an
+# ambiguous one
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
-# Range of the scale of a convention (source's distances ÷ IMU's distances) that is not doubtful
+# Range of the scale factor of the positions, relative to the displacement from the IMU, that is not
+# doubtful
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
 # Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
 MAX_RESIDUAL_RATIO = 2.4
-# Position error (m) of the second differences of the IMU
-IMU_ERROR_M = 0.05
-# Maximum log-likelihood deficit of EKF2's heading for which it is preferred to the gyroscopes'
-# heading, because it is relative to north
-MAX_LOGGED_DEFICIT = 20.0
-# Minimum log-likelihood gain by a clock drift that is corrected
+# σ (m) of the second differences of the position that are integrated from the IMU
+IMU_SIGMA_M = 0.05
+# EKF2's heading is used, because it is relative to north, unless its log likelihood is lower than
+# that of the gyroscopes' heading by more than this difference
+MAX_LOGGED_HEADING_DEFICIT = 20.0
+# Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
 MIN_DRIFT_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
-# Maximum fraction of repeated positions that are ignored
+# Repeated positions are removed if they are less than this fraction of all positions
 MAX_REPEATED_FRACTION = 0.5
-# Minimum fraction of positions with a height for the use of heights
+# Heights are used if at least this fraction of the positions has a height
 MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE_VARIANCE = 20.0
@@ -78,7 +80,7 @@ def check_convention(
 
     Returns
     -------
-    Convention, or None without IMU data or attitude.
+    Convention, or None without IMU data, attitude or enough motion at the same time.
     """
     inertial = read_inertial(flight)
     if inertial is None:
@@ -89,7 +91,7 @@ def check_convention(
     }
     hypotheses = _search_hypotheses(positions, motions)
     if not hypotheses:
-        return Convention(verdict="not determinable")
+        return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.with_clock_drift(clock_drift)
         with_drift = _search_hypotheses(positions_without_drift, motions)
@@ -129,7 +131,7 @@ def _search_hypotheses(
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_LOGGED_DEFICIT
+            and hypothesis.score > hypotheses[0].score - MAX_LOGGED_HEADING_DEFICIT
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
@@ -159,7 +161,7 @@ def _choose_convention(
     elif (
         best_hypothesis.score
         < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_count
-        or best_hypothesis.scale > MAX_SCALE
+        or best_hypothesis.min_scale > MAX_SCALE
         or best_hypothesis.max_scale < MIN_SCALE
         or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
     ):
@@ -177,12 +179,12 @@ def _choose_convention(
         z=z,
         unit=best_hypothesis.unit,
         heading_from=best_hypothesis.heading_from,
-        is_mirrored=best_hypothesis.family.is_mirrored,
+        is_mirrored=best_hypothesis.assignment.is_mirrored,
         rotation_deg=-float(np.degrees(best_hypothesis.remainder_rad))
         * best_hypothesis.has_rotation,
         late_s=best_hypothesis.offset_s,
         clock_drift=clock_drift,
-        scale=best_hypothesis.scale,
+        scale=best_hypothesis.min_scale,
         log_odds=log_odds,
         log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
@@ -214,7 +216,7 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
         * residual_deviation
         * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
-    return float(hypothesis.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
+    return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_SIGMA_M))
 
 
 def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> float:
@@ -256,28 +258,34 @@ def _check_orientation(
     if checked_orientation is None:
         return None
     convention, time_s, attitude = checked_orientation
-    is_known = convention.verdict in ("determined", "ambiguous") and verdict == "determined"
-    if not is_known or best.family.vertical_axis != 2 or best.family.is_mirrored:
+    is_convention_known = (
+        convention.verdict in ("determined", "ambiguous") and verdict == "determined"
+    )
+    if not is_convention_known or best.assignment.vertical_axis != 2 or best.assignment.is_mirrored:
         return convention
-    own_heading = np.interp(inertial.time_s, time_s, heading(attitude))
-    imu_motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, own_heading))
-    is_covered = (imu_motion.time_s > time_s[0] + WINDOW_S) & (
-        imu_motion.time_s < time_s[-1] - WINDOW_S
+    source_heading = np.interp(inertial.time_s, time_s, heading(attitude))
+    imu_motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, source_heading))
+    is_covered = (imu_motion.time_s > time_s[0] + DIFFERENCE_WINDOW_S) & (
+        imu_motion.time_s < time_s[-1] - DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # correct headings (°) of the x axis of the positions, given the frame of the orientation
-    directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
-    if best.family.vertical_sign > 0:
-        directions_deg = [0.0]
+    # heading (°) that x of the positions must have, by frames of the orientation; two values if
+    # these frames do not determine it
+    correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
+        convention.frames, [0.0, 90.0]
+    )
+    if best.assignment.vertical_sign > 0:
+        correct_headings_deg = [0.0]
     for hypothesis in search(positions, {"EKF2": imu_motion}):
-        if (hypothesis.family, hypothesis.unit, hypothesis.has_rotation) == (
-            best.family,
+        if (hypothesis.assignment, hypothesis.unit, hypothesis.has_rotation) == (
+            best.assignment,
             best.unit,
             True,
         ):
             x_deg = float(np.degrees(hypothesis.parameters[1]))
             heading_errors = [
-                (x_deg - direction_deg + 180.0) % 360.0 - 180.0 for direction_deg in directions_deg
+                (x_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
+                for correct_heading_deg in correct_headings_deg
             ]
             return structs.replace(convention, heading_error_deg=min(heading_errors, key=abs))
     return convention

@@ -23,15 +23,16 @@ from px4fuse.flight.model import (
 )
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) that is corrected in a frame with wrong axes; a smaller one is a heading
-# error
+# Minimum rotation (°) that is corrected in a frame with wrong axes; smaller rotations are reported
+# as a heading error
 MIN_REMAINDER_DEG = 8.0
-# Minimum rotation (°) that is corrected in a frame with correct axes; a smaller one is a heading
-# error
+# Minimum rotation (°) that is corrected in a frame with correct axes; smaller rotations are
+# reported as a heading error
 MIN_ROTATION_DEG = 15.0
-# Minimum delay (s) that is corrected with the convention; a smaller one is a time offset
+# Minimum delay (s) that is corrected together with axes and unit; smaller delays are left to the
+# estimate of the time offset
 MIN_CORRECTED_DELAY_S = 0.5
-# Minimum heading difference (°) between a wrong orientation and the motion of its source
+# Minimum heading error (°) of the source's orientation, relative to its positions, that is a fault
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
@@ -54,9 +55,9 @@ class Faults:
     affects_ekf2 : bool
         True if EKF2 fused the source, so EKF2's attitude is wrong too.
     is_north_unknown : bool
-        True if EKF2's heading is from the source.
+        True if EKF2's heading is from the source, so the log contains no independent heading.
     is_ambiguous : bool
-        True if several conventions fit, but not NED in metres.
+        True if several conventions fit, and NED in metres is not among them.
     """
 
     has_wrong_axes: bool = False
@@ -106,16 +107,21 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
     is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
     has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
-    is_drifting = convention.heading_from == "gyroscopes"
-    # EKF2 fused the yaw of the source, so nothing in the log shows north
-    has_own_heading = (
+    uses_gyro_heading = convention.heading_from == "gyroscopes"
+    # EKF2 fused the yaw of the source, so no heading in the log is independent of the source
+    is_heading_from_source = (
         is_fused
-        and is_drifting
+        and uses_gyro_heading
         and convention.orientation is not None
         and orientation_fault != "copied"
     )
-    is_other_drift = is_drifting and not is_fused and not has_wrong_axes
-    if has_wrong_heading or has_own_heading or is_other_drift or frame == "FRD":
+    is_unfused_with_gyro_heading = uses_gyro_heading and not is_fused and not has_wrong_axes
+    if (
+        has_wrong_heading
+        or is_heading_from_source
+        or is_unfused_with_gyro_heading
+        or frame == "FRD"
+    ):
         rotation_deg = 0.0
     faults = Faults(
         has_wrong_axes=has_wrong_axes,
@@ -124,7 +130,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         late_s=convention.late_s if abs(convention.late_s) >= MIN_CORRECTED_DELAY_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=orientation_fault,
-        is_north_unknown=has_wrong_axes and has_own_heading,
+        is_north_unknown=has_wrong_axes and is_heading_from_source,
     )
     return replace(
         faults, affects_ekf2=is_fused and (faults.has_position_fault or has_wrong_heading)
@@ -134,8 +140,8 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     """Return (True if the axes are not NED, clockwise rotation of the positions in °)."""
     rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
-    is_known = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
-    if convention.is_mirrored or is_known or convention.z not in ("up", "down"):
+    is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
+    if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
     total_deg = rotation_deg - 90.0 * CLOCKWISE.index(convention.x) + 90.0 * is_up
     total_deg = (total_deg + 180.0) % 360.0 - 180.0
@@ -169,10 +175,8 @@ def correct_convention(
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
     to_ned = _matrix_to_ned_metres(convention, faults)
-    position_m = samples[Columns.POSITION].to_numpy() @ to_ned.T
-    variance_m2 = samples[Columns.POSITION_VARIANCE].to_numpy()
-    is_unknown = np.isnan(variance_m2).all(axis=1, keepdims=True)
-    variance_m2 = np.where(is_unknown, np.nan, np.nan_to_num(variance_m2) @ (to_ned**2).T)
+    position_m = _transform_known(samples[Columns.POSITION].to_numpy(), to_ned)
+    variance_m2 = _transform_known(samples[Columns.POSITION_VARIANCE].to_numpy(), to_ned**2)
     samples = pd.DataFrame(
         np.hstack([position_m, variance_m2]),
         _corrected_times(samples.index, faults),
@@ -191,7 +195,7 @@ def correct_convention(
     if inertial is None:
         return flight, track
     attitude = inertial.attitudes[convention.heading_from]
-    # the axes of the positions are right: rotate the attitude to the same north
+    # the axes of the positions are correct: rotate the attitude to the north of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
@@ -212,6 +216,12 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
     return np.asarray(unit_m * rotation @ np.array(permutation))
+
+
+def _transform_known(values: Array, matrix: Array) -> Array:
+    """Multiply each row by a matrix; NaN only where an unknown value contributes."""
+    is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
+    return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.convention.motion import (
-    GRID_S,
-    WINDOW_S,
+    DIFFERENCE_WINDOW_S,
+    GRID_INTERVAL_S,
     SourceMotion,
     motion_from_imu,
     read_inertial,
@@ -18,7 +18,7 @@ from px4fuse.trajectory.scores import autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_ARM_M = 0.2
-# Minimum lever arm, in σ of its estimate, that is reported: without a lever arm 1.5 is possible
+# Minimum lever arm, in σ of its estimate, that is reported: 1.5 σ occur without a lever arm
 MIN_ARM_SIGMAS = 2.5
 # Minimum lever arm (m) that is reported if it is estimated with ground truth
 MIN_TRUE_ARM_M = 0.05
@@ -49,7 +49,7 @@ class LeverArm(NamedTuple):
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm that EKF2's parameters lack, from ground truth if logged."""
+    """Estimate the lever arm that is not in EKF2's parameters, from ground truth if logged."""
     lever_arm = None
     if isinstance(flight.truth, Truth):
         lever_arm = _fit_to_truth(flight, flight.truth, track)
@@ -122,7 +122,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
             difference_m[is_used].ravel(),
         )
         # second differences overlap over twice the window, so only these are independent
-        independent_count = len(used_differences_m) * GRID_S / (2.0 * WINDOW_S)
+        independent_count = len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
         if independent_count < 2 * design_rows.shape[1]:
             return None
         fitted_parameters = np.linalg.lstsq(design_rows, used_differences_m, rcond=None)[0]

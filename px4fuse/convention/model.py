@@ -19,13 +19,14 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     Attributes
     ----------
     verdict : str
-        "copied": equal to EKF2's attitude; "unrelated": no convention fits the attitude.
+        "ambiguous": several conventions fit; "copied": equal to EKF2's attitude; "unrelated": no
+        convention fits the attitude.
     order : {"w x y z", "x y z w"}
         Order of the quaternion's components as sent.
     frames : str
         Body frame and world frame of the orientation.
     heading_error_deg : float or None
-        Heading of the orientation relative to the positions, clockwise from above.
+        Heading error relative to the frame of the positions, clockwise from above.
     tilt_difference_deg : float
         Median tilt difference from the gyroscopes' attitude.
     """
@@ -37,13 +38,14 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     tilt_difference_deg: NotNegative = 0.0
 
 
-class Convention(Record, kw_only=True):
+class Convention(Record, kw_only=True, omit_defaults=False):
     """Axes, unit and clock of the positions of a source, as sent.
 
     Attributes
     ----------
     verdict : str
-        "doubtful": the best convention leaves residuals larger than the noise.
+        "ambiguous": several conventions fit; "doubtful": the residuals of the best convention are
+        larger than the noise; "not determinable": too little data or motion.
     rotation_deg : float
         Rotation of the positions relative to the axes x, y, z, clockwise from above.
     heading_from : {"EKF2", "gyroscopes"}
@@ -53,7 +55,7 @@ class Convention(Record, kw_only=True):
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Distances of the source relative to those of the IMU.
+        Scale factor of the positions, relative to the displacement from the IMU.
     log_odds : float or None
         Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float

@@ -34,15 +34,15 @@ from px4fuse.trajectory.rotation import (
 # Standard gravity (m/s²)
 GRAVITY_M_S2 = 9.80665
 # Time T (s) between the three positions of a second difference
-WINDOW_S = 2.0
+DIFFERENCE_WINDOW_S = 2.0
 # Sample interval (s) of the second differences
-GRID_S = 0.1
+GRID_INTERVAL_S = 0.1
 # Integration step (s) of the IMU
-STEP_S = 0.02
+INTEGRATION_STEP_S = 0.02
 # Length (s) of the running mean that is subtracted from the second differences
-HIGH_PASS_S = 12.0
+HIGH_PASS_WINDOW_S = 12.0
 # Length (s) of the centred running mean of the specific force that defines the vertical
-LEVELLING_S = 40.0
+LEVELLING_WINDOW_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
 # Minimum length (s) of a gap between two positions
@@ -51,7 +51,7 @@ MIN_GAP_S = 0.35
 
 @dataclass(frozen=True)
 class Inertial:
-    """Specific force and attitude at a constant interval ``STEP_S``.
+    """Specific force and attitude at a constant interval ``INTEGRATION_STEP_S``.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class SourceMotion:
-    """Second differences of positions, at a constant interval ``GRID_S``."""
+    """Second differences of positions, at a constant interval ``GRID_INTERVAL_S``."""
 
     time_s: Array
     table: Array
@@ -92,8 +92,8 @@ class SourceMotion:
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
-        window_steps = round(WINDOW_S / GRID_S)
-        at_s = grid_s[0] + GRID_S * np.arange(-window_steps, len(grid_s) + window_steps)
+        window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
+        at_s = grid_s[0] + GRID_INTERVAL_S * np.arange(-window_steps, len(grid_s) + window_steps)
         is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
         columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
         is_valid = (
@@ -133,13 +133,15 @@ def read_inertial(flight: Flight) -> Inertial | None:
     if isinstance(imu, Unavailable) or isinstance(attitude, Unavailable):
         return None
     imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    time_s = np.arange(max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1]), STEP_S)
-    if len(time_s) < 4 * WINDOW_S / STEP_S:
+    time_s = np.arange(
+        max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1]), INTEGRATION_STEP_S
+    )
+    if len(time_s) < 4 * DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     imu_integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
     integral_steps = np.diff([np.interp(time_s, imu_s, column) for column in imu_integral.T]).T
-    force_m_s2 = integral_steps[:, :3] / STEP_S
+    force_m_s2 = integral_steps[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
     gyro_attitude = _level_attitude(
         _integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2
@@ -173,7 +175,7 @@ def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
     )
     excess_sum_rad = np.cumsum(excess_rad, axis=0)
-    window_steps = round(GYRO_BIAS_WINDOW_S / STEP_S)
+    window_steps = round(GYRO_BIAS_WINDOW_S / INTEGRATION_STEP_S)
     gyro_bias_rad = (
         np.median(excess_sum_rad[window_steps:] - excess_sum_rad[:-window_steps], axis=0)
         / window_steps
@@ -188,7 +190,9 @@ def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
     mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
         mean_force_m_s2 = running_mean(
-            mean_force_m_s2, np.ones(len(mean_force_m_s2), dtype=bool), round(LEVELLING_S / STEP_S)
+            mean_force_m_s2,
+            np.ones(len(mean_force_m_s2), dtype=bool),
+            round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S),
         )
     vertical = mean_force_m_s2 / np.maximum(
         np.linalg.norm(mean_force_m_s2, axis=1, keepdims=True), 1.0
@@ -213,7 +217,7 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    filtered = values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S))
+    filtered = values - running_mean(values, is_valid, round(HIGH_PASS_WINDOW_S / GRID_INTERVAL_S))
     filtered[~is_valid] = 0.0
     return filtered
 
@@ -234,17 +238,24 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
-    velocity_m_s = np.cumsum(table, axis=0) * STEP_S
-    np.cumsum((velocity_m_s - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position_m[1:])
-    window_steps, stride = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
+    velocity_m_s = np.cumsum(table, axis=0) * INTEGRATION_STEP_S
+    np.cumsum(
+        (velocity_m_s - table * (INTEGRATION_STEP_S / 2.0)) * INTEGRATION_STEP_S,
+        axis=0,
+        out=position_m[1:],
+    )
+    window_steps = round(DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
+    stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = second_difference(position_m, window_steps)[::stride]
     time_s = inertial.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
     is_valid = inside_spans(time_s, inertial.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
-        is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)
+        is_valid &= (time_s < end - DIFFERENCE_WINDOW_S) | (time_s > start + DIFFERENCE_WINDOW_S)
     filtered = high_pass(second_differences, is_valid)
-    return ImuMotion(time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_S, axis=0))
+    return ImuMotion(
+        time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_INTERVAL_S, axis=0)
+    )
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:

@@ -32,15 +32,15 @@ FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
 # Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused
 # motion capture by more than 0.2°
-MAX_COPY_DEG = 0.15
+MAX_COPY_DIFFERENCE_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 # Maximum median tilt difference (°) of a correct convention
-MAX_TILT_DEG = 6.0
+MAX_TILT_DIFFERENCE_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
-MAX_HEADING_DEG = 12.0
+MAX_HEADING_DIFFERENCE_DEG = 12.0
 # Minimum tilt or heading difference (°) in the score: a smaller one is noise
-MIN_DIFFERENCE_DEG = 0.7
+MIN_SCORED_DIFFERENCE_DEG = 0.7
 # Decrease of a convention's score per second of flight and per unit of ln(angle difference)
 SCORE_PER_S = 0.5
 # Minimum score difference between the best and the second best convention
@@ -60,7 +60,7 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames of the quaternion; ENU equals NWU, because only the heading differs."""
+        """Order and frames of the quaternion; ENU as NWU, because both differ only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
@@ -81,12 +81,14 @@ def check_orientation(
     for delay_s in COPY_DELAYS_S:
         logged_attitude = interpolate(sample_s - delay_s, inertial.time_s, inertial.logged_attitude)
         cosine = np.clip(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0)
-        if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DEG):
+        if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
             return OrientationConvention(verdict="copied"), sample_s, sent_quaternions
     reference_attitude = interpolate(sample_s, inertial.time_s, inertial.gyro_attitude)
     candidates = [
-        _make_candidate(sample_s, sent_quaternions, reference_attitude, order, frames, quarters)
-        for order, frames, quarters in product(ORDERS, FRAMES, range(4))
+        _make_candidate(
+            sample_s, sent_quaternions, reference_attitude, order, frames, quarter_turns
+        )
+        for order, frames, quarter_turns in product(ORDERS, FRAMES, range(4))
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best = candidates[0]
@@ -95,7 +97,10 @@ def check_orientation(
     )
     convention = best.convention
     tilt_deg = convention.tilt_difference_deg
-    if tilt_deg > MAX_TILT_DEG or best.heading_difference_deg > MAX_HEADING_DEG:
+    if (
+        tilt_deg > MAX_TILT_DIFFERENCE_DEG
+        or best.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
+    ):
         convention = replace(convention, verdict="unrelated")
     elif best.score - second_best.score < MIN_LOG_ODDS:
         convention = replace(convention, verdict="ambiguous")
@@ -110,20 +115,27 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 
 
 def _make_candidate(
-    time_s: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
+    time_s: Array,
+    sent: Array,
+    reference: Array,
+    order: Order,
+    frames: Frames,
+    body_quarter_turns: int,
 ) -> Candidate:
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
-    body_rotation = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
+    body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
     attitude = multiply(to_attitude(sent, convention), body_rotation)
     heading_difference = np.exp(1j * (heading(attitude) - heading(reference)))
     offset_rad = np.angle(np.mean(heading_difference))
-    spread_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
+    heading_difference_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
     tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
     tilt_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
-    tilt_deg, heading_deg = np.degrees(np.median([tilt_rad, spread_rad], axis=1)).tolist()
-    log_differences = np.log(np.maximum([tilt_deg, heading_deg], MIN_DIFFERENCE_DEG))
+    tilt_deg, heading_deg = np.degrees(
+        np.median([tilt_rad, heading_difference_rad], axis=1)
+    ).tolist()
+    log_differences = np.log(np.maximum([tilt_deg, heading_deg], MIN_SCORED_DIFFERENCE_DEG))
     score = -SCORE_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
-    score -= 2.0 * (body_quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
+    score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
     convention = replace(convention, tilt_difference_deg=tilt_deg)
     return Candidate(convention, heading_deg, score)

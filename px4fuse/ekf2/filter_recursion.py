@@ -139,8 +139,7 @@ class FilterConfiguration:
         if self.timestamp_offset_s is not None:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
-        delay_names = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
-        max_delay_ms = max(self.settings[name] for name in delay_names)
+        max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
         if inputs.rules.uses_delay_as_horizon:  # the length of the IMU buffer is the largest delay
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.step_s))

@@ -76,7 +76,6 @@ STEP_TOLERANCE_S = 1e-4
 DEAD_RECKONING_S = 1.0
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
 GNSS_VELOCITY_BIT = 4
-GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
 # Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
@@ -253,9 +252,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    modelled_aids = (
-        (*GNSS_LABELS, *([FLOW.label] if len(fusion_record.flow) else [])) if is_gnss else ()
-    )
+    flow_labels = [FLOW.label] if len(fusion_record.flow) else []
+    modelled_aids = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
     if unmodelled_aids := [
         label for label in fusion_record.other_horizontal_aids if label not in modelled_aids
     ]:

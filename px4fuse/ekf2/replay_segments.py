@@ -562,18 +562,21 @@ def _add_field(
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
-    field_values = field_gauss.iloc[:, :3].to_numpy()
-    field_states = np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
-    variance = np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]])
+    measured_at_s = sample_times_s - age_s
     extended_segment = add_field_states(
-        segment, sample_times_s - age_s, field_values, samples_per_row, field_states, variance
+        segment,
+        measured_at_s,
+        field_gauss.iloc[:, :3].to_numpy(),
+        samples_per_row,
+        np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]]),
+        np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]]),
     )
     if Columns.FIELD_INNOVATION[0] not in field_gauss:
         return extended_segment
     filtered_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
         extended_segment,
-        field=_mean_field(segment, fusion_record.delayed, sample_times_s - age_s, filtered_gauss),
+        field=_mean_field(segment, fusion_record.delayed, measured_at_s, filtered_gauss),
     )
 
 

@@ -22,6 +22,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.replay import (
+    HORIZONTAL,
     Ekf2Replay,
     Spans,
     component_along,
@@ -171,6 +172,7 @@ def explain_by_steps(
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
+    runs = runs or {}
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = step_configurations(model.inputs, settings or Settings())
@@ -182,7 +184,7 @@ def explain_by_steps(
     # compare only at times that the replay and all KF runs cover
     for index in (
         baseline_replay.delayed.index,
-        *(run.steps.index for run in (runs or {}).values()),
+        *(run.steps.index for run in runs.values()),
     ):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
     state_times_s = state_times_s[is_inside]
@@ -193,13 +195,13 @@ def explain_by_steps(
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
-    directions = {name: run.axis.direction for name, run in (runs or {}).items()}
-    directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    stage_names = []
+    directions = {name: run.axis.direction for name, run in runs.items()}
+    directions = directions or dict(zip(HORIZONTAL, np.eye(3), strict=False))
+    stages = []
     # tracks are computed one at a time, to limit memory
     tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
-        stage_names.append(
+        stages.append(
             [
                 [
                     component_along(track, columns, direction, state_times_s)
@@ -218,9 +220,9 @@ def explain_by_steps(
     steps_by_axis = {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        kf_state = state_at(runs[axis], state_times_s) if runs else stage_names[0][axis_index]
+        kf_state = state_at(runs[axis], state_times_s) if runs else stages[0][axis_index]
         # position and velocity of KF, of k replays, and of the logged EKF2: shape (k + 2, 2, n)
-        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stage_names)])
+        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
         difference_by_step_m = positions_by_step - positions_by_step[-1]
         rmse_by_step = [
             rms_to_truth(model.flight, track, direction, state_times_s)

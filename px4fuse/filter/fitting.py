@@ -56,6 +56,8 @@ DERIVATIVE_LOG_STEP = 1e-4
 LIKELIHOOD_NODES = 10, 0.25
 # Number and distance (ln σ) of the nodes while the outlier probabilities still change
 COARSE_LIKELIHOOD_NODES = 6, 0.2
+# Number of measurements at the start of a long flight that give the initial values of its noise fit
+FIRST_MEASUREMENTS = 2000
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
@@ -252,6 +254,8 @@ class NoiseFit:
         -ln p as a function of the noises.
     sigma_z_variance_factor : float
         Factor on the variance of ln SIGMA_Z, at least 1, because the outliers are uncertain.
+    outlier_share, outlier_width : float
+        Fraction of outliers, and their σ over SIGMA_Z.
     """
 
     noises: Noises
@@ -259,6 +263,8 @@ class NoiseFit:
     outlier_probability: Array
     score: Likelihood
     sigma_z_variance_factor: float
+    outlier_share: float
+    outlier_width: float
 
     @property
     def lowest_score(self) -> float:
@@ -301,6 +307,9 @@ def maximise_likelihood(
 ) -> NoiseFit:
     """Estimate the noises and, if ``fits_outliers`` is True, the outliers by maximum likelihood.
 
+    The fit of a long flight starts at the result of the flight's first measurements, which leaves
+    only small changes: fewer nodes and fewer iterations are then sufficient.
+
     Parameters
     ----------
     axis_positions : sequence of Positions
@@ -313,8 +322,18 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    outlier_share = START_OUTLIER_FRACTION
-    outlier_width = START_OUTLIER_WIDTH
+    outlier_share, outlier_width = START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
+    is_long = len(weight) > 2 * FIRST_MEASUREMENTS
+    if is_long:
+        first_positions = [
+            positions.first(len(positions.measurement_m) - len(weight) + FIRST_MEASUREMENTS)
+            for positions in axis_positions
+        ]
+        first_fit = maximise_likelihood(
+            first_positions, start_noises, weight[:FIRST_MEASUREMENTS], fits_outliers
+        )
+        start_noises = first_fit.noises
+        outlier_share, outlier_width = first_fit.outlier_share, first_fit.outlier_width
     noises = start_noises
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m, is_coarse=True)
@@ -332,29 +351,31 @@ def maximise_likelihood(
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        new_probability = _outlier_probability(
-            expected_squares_m2 / sigma_z_variance_m2, axis_counts, outlier_share, outlier_width
-        )
+        normalised_squares = expected_squares_m2 / sigma_z_variance_m2
+        previous_probability = outlier_probability
+        for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
+            outlier_probability = _outlier_probability(
+                normalised_squares, axis_counts, outlier_share, outlier_width
+            )
+            outlier_share = float(
+                np.clip(outlier_probability.mean(), 0.5 / len(weight), MAX_OUTLIER_FRACTION)
+            )
+            outlier_square = np.sum(outlier_probability * normalised_squares) / max(
+                np.sum(outlier_probability * axis_counts), 1e-9
+            )
+            outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square)))
         if (
-            new_probability.sum() < 1.0
-            and new_probability.max() < 0.5
-            and not outlier_probability.any()
+            outlier_probability.sum() < 1.0
+            and outlier_probability.max() < 0.5
+            and not previous_probability.any()
         ):
+            outlier_probability = previous_probability
             break
-        outlier_share = float(
-            np.clip(new_probability.mean(), 0.5 / len(new_probability), MAX_OUTLIER_FRACTION)
-        )
-        outlier_square = np.sum(new_probability * expected_squares_m2) / max(
-            np.sum(new_probability * axis_counts), 1e-9
-        )
-        outlier_width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / sigma_z_variance_m2)))
-        weight = 1.0 - new_probability * (1.0 - outlier_width**-2.0)
-        probability_change = np.abs(new_probability - outlier_probability)
-        outlier_probability = new_probability
-        if probability_change.max() < MAX_PROBABILITY_CHANGE:
+        weight = 1.0 - outlier_probability * (1.0 - outlier_width**-2.0)
+        if np.abs(outlier_probability - previous_probability).max() < MAX_PROBABILITY_CHANGE:
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(sigma_z_variance_m2)))
-    likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m)
+    likelihood = Likelihood(axis_positions, weight, start_noises.sigma_z_m, is_coarse=is_long)
     noises = _maximise_by_gradient(likelihood, noises)
     sigma_z_variance_factor = 1.0
     if outlier_probability.any():
@@ -365,7 +386,27 @@ def maximise_likelihood(
             outlier_probability,
             outlier_width,
         )
-    return NoiseFit(noises, weight, outlier_probability, likelihood, sigma_z_variance_factor)
+    return NoiseFit(
+        noises,
+        weight,
+        outlier_probability,
+        likelihood,
+        sigma_z_variance_factor,
+        outlier_share,
+        outlier_width,
+    )
+
+
+def outlier_probability(axis_positions: Sequence[Positions], fit: NoiseFit, count: int) -> Array:
+    """Return the outlier probability of ``count`` measurements with the noises of another fit."""
+    probability = np.zeros(count)
+    for _ in range(MAX_COARSE_ITERATIONS):
+        weight = 1.0 - probability * (1.0 - fit.outlier_width**-2.0)
+        squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, fit.noises, weight)
+        probability = _outlier_probability(
+            squares_m2 / fit.noises.sigma_z_m**2, axis_counts, fit.outlier_share, fit.outlier_width
+        )
+    return probability
 
 
 def _expected_squares_of_axes(

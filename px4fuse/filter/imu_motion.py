@@ -59,8 +59,6 @@ COARSE_OFFSET_COUNT = 25
 COARSE_MEASUREMENTS = 600
 # Maximum number of array elements per batch of time offsets, which limits memory
 SIGNALS_PER_BATCH = 2**16
-# Minimum number of time offsets that are computed together
-MIN_BATCH_OFFSETS = 3
 # Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
 # Minimum number of position measurements in a segment
@@ -80,9 +78,9 @@ MAX_IMU_INTERVAL_S = 0.025
 class Signals:
     """Motion of one segment from the IMU, and its sensitivity to constant errors.
 
-    ``table``, shape (n, 3, 3, 1 + constants), contains position, velocity and acceleration (second
-    dimension) along NED (third). The last dimension is the motion without errors, then its
-    derivative with respect to each constant. An acceleration applies until the next time.
+    ``table``, shape (n, 2, 3, 1 + constants), contains position and velocity (second dimension)
+    along NED (third). The last dimension is the motion without errors, then its derivative with
+    respect to each constant. Between two times the acceleration is constant.
     """
 
     time_s: Array
@@ -90,10 +88,11 @@ class Signals:
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Interpolate position and velocity at other times, shape (..., 3, 1 + constants)."""
-        last_index = len(self.time_s) - 1
+        last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
-        position, velocity, acceleration = np.moveaxis(self.table[row], -3, 0)
+        position, velocity = np.moveaxis(self.table[row], -3, 0)
+        acceleration = (self.table[row + 1, 1] - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -187,7 +186,7 @@ class PreparedMotion:
     def position_batches(self, offset_s: Array, *, has_scale: bool = True) -> Iterator[Positions]:
         """Yield the positions for batches of time offsets; ``has_scale``: with an unknown scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
-        batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
+        batch_size = max(1, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
             positions = self.positions(batch)
             yield centre_on_path(positions, has_scale=True) if has_scale else positions
@@ -341,8 +340,9 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
         multiply(attitude_quaternion[:-1], from_vector(np.diff(rotation_vector, axis=0) / 2.0))
     )
     force_ned = rotate(body_to_ned, mean_force)
-    table = np.zeros((len(mean_force), 3, 3, len(CONSTANT_SIGMAS)))
-    position, velocity, acceleration = np.moveaxis(table, 1, 0)
+    table = np.zeros((len(mean_force), 2, 3, len(CONSTANT_SIGMAS)))
+    position, velocity = np.moveaxis(table, 1, 0)
+    acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
     # a rotation of the attitude by a small angle θ adds θ × f to the acceleration; a gyro bias b

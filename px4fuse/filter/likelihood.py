@@ -7,11 +7,11 @@ and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
+from scipy.linalg import lapack
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
@@ -61,10 +61,6 @@ class Preintegrated:
     noise_fixed: Array
     measurement_m: Array
     initial: InitialState
-
-    def first_measurements(self, count: int) -> Preintegrated:
-        arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
-        return replace(self, **arrays)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
@@ -143,38 +139,51 @@ def innovations(
         Measurements with an innovation but without an update.
     """
     q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
-    p, v = intervals.initial.position_m, intervals.initial.velocity_m_s
-    covariance: Symmetric[Any] = INITIAL_COVARIANCE
-    innovations_and_variances = []
-    for dt, dp, dv, noise_unit, noise_fixed, z, skips_update in zip(
+    covariance: Symmetric[float] = INITIAL_COVARIANCE
+    variances_and_gains = []
+    for dt, noise_unit, noise_fixed, skips_update in zip(
         intervals.length_s.tolist(),
-        _values_by_measurement(intervals.delta_position_m),
-        _values_by_measurement(intervals.delta_velocity_m_s),
         intervals.noise_unit.tolist(),
         intervals.noise_fixed.tolist(),
-        _values_by_measurement(intervals.measurement_m),
-        [False] * len(intervals.measurement_m) if is_skipped is None else is_skipped.tolist(),
+        [False] * len(intervals.length_s) if is_skipped is None else is_skipped.tolist(),
         strict=True,
     ):
-        # x = Fx + Ba, P = FPFᵀ + Q
-        p = p + dt * v + dp
-        v = v + dv
-        p00, p01, p11 = propagate_covariance(covariance, dt)
-        p00 = p00 + q * noise_unit[0] + noise_fixed[0]
-        p01 = p01 + q * noise_unit[1] + noise_fixed[1]
-        p11 = p11 + q * noise_unit[2] + noise_fixed[2]
-        covariance = p00, p01, p11
-        (nu, s, _, _), updated_state = update_step(p, v, covariance, z, r)
-        if not skips_update:
-            p, v, covariance = updated_state
-        innovations_and_variances.append((nu, s))
-    nu, s = map(np.array, zip(*innovations_and_variances, strict=True))
-    return nu, s
-
-
-def _values_by_measurement(values: Array) -> list[Any]:
-    """Return a list of numbers, or of arrays with k columns."""
-    return values.tolist() if values.ndim == 1 else list(values)
+        p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
+        covariance = (
+            p00 + q * noise_unit[0] + noise_fixed[0],
+            p01 + q * noise_unit[1] + noise_fixed[1],
+            p11 + q * noise_unit[2] + noise_fixed[2],
+        )
+        (_, s, k0, k1), (_, _, updated) = update_step(0.0, 0.0, covariance, 0.0, r)
+        variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
+        covariance = covariance if skips_update else updated
+    s, k0, k1 = np.array(variances_and_gains).T
+    # The states before the updates solve a system with a unit lower band matrix: the state at the
+    # next measurement is x = F(x + K(z - Hx)) + [Δp, Δv]
+    dt = intervals.length_s[1:]
+    position_gain = k0[:-1] + dt * k1[:-1]
+    measured_m = np.ascontiguousarray(intervals.measurement_m.T)
+    right_side = np.empty((*measured_m.shape, 2))
+    right_side[..., 0] = intervals.delta_position_m.T
+    right_side[..., 1] = intervals.delta_velocity_m_s.T
+    right_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
+    right_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
+    initial = intervals.initial
+    right_side[..., 0, 0] += initial.position_m + intervals.length_s[0] * initial.velocity_m_s
+    right_side[..., 0, 1] += initial.velocity_m_s
+    bands = np.zeros((len(s), 2, 4))
+    bands[:-1, 1, 1] = -dt
+    bands[:-1, 0, 2] = position_gain - 1.0
+    bands[:-1, 1, 2] = -1.0
+    bands[:-1, 0, 3] = k1[:-1]
+    state, _ = lapack.dtbtrs(
+        bands.reshape(-1, 4).T,
+        right_side.reshape(-1, 2 * len(s)).T,
+        uplo="L",
+        diag="U",
+        overwrite_b=1,
+    )
+    return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T), s
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:

@@ -91,6 +91,26 @@ class Positions:
         """Mask of the intervals inside a segment, shape (m - 1,)."""
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
+    def first(self, count: int) -> Positions:
+        """Return the first measurements."""
+        interval_rows = np.s_[..., : count - 1]
+        return replace(
+            self,
+            measurement_m=self.measurement_m[:count],
+            segment_starts=self.segment_starts[self.segment_starts < count],
+            prior_precision=self.prior_precision[:count],
+            **{
+                name: getattr(self, name)[interval_rows]
+                for name in (
+                    "length_s",
+                    "noise_unit",
+                    "noise_fixed",
+                    "delta_position_m",
+                    "delta_velocity_m_s",
+                )
+            },
+        )
+
     def in_sigma_z_units(
         self, sigma_z_m: float, random_walk: float, measurement_weights: Array
     ) -> tuple[Positions, Array]:
@@ -217,13 +237,12 @@ def fit_positions(
 ) -> FittedPositions:
     """Fit positions with one SIGMA_A; ``variance_m2``, shape (m,), are the measurement variances.
 
-    ``measured_m``, shape (a, 1 or T, 1 + c, m), replaces the measured positions by other data,
-    followed by their sensitivity to each constant.
+    ``measured_m``, shape (a, 1 or T, k, m), replaces the measured positions by the measurements of
+    the first k signals.
     """
     if measured_m is None:
-        measurement_count, axes = positions.measurement_m.shape
-        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), measurement_count))
-        measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
+        measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
+    measured_count = measured_m.shape[2]
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
@@ -236,21 +255,19 @@ def fit_positions(
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
         axes_measured_m = measured_m[axes]
         intervals, explained = system.whiten(axes_measured_m, dp[axes], dv[axes])
-        signals = (np.sqrt(system.precision[:, 0]) * axes_measured_m, *intervals, explained)
-        for segment_index, (begin, end) in enumerate(positions.segments):
-            interval_rows = slice(begin, end - 1)
+        measured = np.sqrt(system.precision[:, 0]) * axes_measured_m
+        for index, (begin, end) in enumerate(positions.segments):
+            gram[index] += _inner_products(intervals[..., 2 * begin : 2 * (end - 1)])
             state_columns = slice(system.state_count * begin, system.state_count * end)
-            for sign, array, columns in zip(
-                (1.0, 1.0, 1.0, -1.0),
-                signals,
-                (slice(begin, end), interval_rows, interval_rows, state_columns),
-                strict=True,
-            ):
-                segment_signal = array[..., columns]
-                gram[segment_index] += sign * (
-                    segment_signal @ np.swapaxes(segment_signal, -1, -2)
-                ).sum(axis=0)
+            gram[index] -= _inner_products(explained[..., state_columns])
+            measured_products = _inner_products(measured[..., begin:end])
+            gram[index, :, :measured_count, :measured_count] += measured_products
     return FittedPositions(gram, log_determinant, degrees_of_freedom, positions.constant_sigma)
+
+
+def _inner_products(signals: Array) -> Array:
+    """Return the inner products of signals, summed over the axes."""
+    return np.asarray((signals @ np.swapaxes(signals, -1, -2)).sum(axis=0))
 
 
 def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Positions:
@@ -266,7 +283,7 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
     for axes, system, _ in positions.factorised_equations(
         sigma_a, np.full(len(measured_m), sigma_z**2)
     ):
-        axes_measured_m = np.nan_to_num(measured_m[:, axes].T)[:, None]
+        axes_measured_m = np.repeat(np.nan_to_num(measured_m[:, axes].T)[:, None], dp.shape[1], 1)
         smoothed_state = system.solve(axes_measured_m, dp[axes, :, 0], dv[axes, :, 0])
         smoothed_state[:, :, positions.segment_starts] = 0.0
         path_m = smoothed_state[..., 0]
@@ -345,12 +362,12 @@ def products_by_segment(
             )[:, None]
             for increment, constant_signal in zip(increments, constant_signals, strict=True)
         )
-        batch_measured_m = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
         first_rows, second_rows, constant_rows = np.split(
             np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch_signals].shape[1]
         )
-        batch_measured_m[:, 0, first_rows] = first_measured_m[batch_signals]
-        batch_measured_m[:, 0, second_rows] = measured_m[batch_signals]
+        batch_measured_m = np.concatenate(
+            [first_measured_m[batch_signals], measured_m[batch_signals]], axis=1
+        )[:, None]
         all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
         gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, batch_measured_m).gram[:, 0]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
@@ -399,7 +416,7 @@ class BandedSystem:
         """2 (position, velocity), or 3 with time-correlated noise."""
         return len(self.bands) - 2
 
-    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
+    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
         """Whiten signals, so that their inner products are sums of plain products.
 
         Inner product = product of ``intervals`` - product of ``explained`` + product of the
@@ -407,20 +424,24 @@ class BandedSystem:
 
         Parameters
         ----------
-        measured_m : ndarray, shape (..., m)
-        dp, dv : ndarray, shape (..., m - 1)
+        measured_m : ndarray, shape (..., k, m)
+            Measurements of the first k signals; the others have none.
+        dp, dv : ndarray, shape (..., signals, m - 1)
             Δp (m) and Δv (m/s) of the intervals.
 
         Returns
         -------
-        intervals : two ndarray, shape (..., m - 1)
+        intervals : ndarray, shape (..., signals, 2 · (m - 1))
             Whitened Δp and Δv.
-        explained : ndarray, shape (..., states · m)
+        explained : ndarray, shape (..., signals, states · m)
             Component of the signals that the states explain.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
-        explained, _ = lapack.dtbtrs(self.cholesky_factor, right_side.T, uplo="L", overwrite_b=1)
-        return intervals, explained.T.reshape(*dp.shape[:-1], -1)
+        # a unit diagonal is 30 % faster, because it needs no division in each row
+        diagonal = self.cholesky_factor[0]
+        unit_factor = self.cholesky_factor / diagonal
+        explained, _ = lapack.dtbtrs(unit_factor, right_side.T, uplo="L", diag="U", overwrite_b=1)
+        return intervals, (explained.T / diagonal).reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
@@ -428,16 +449,17 @@ class BandedSystem:
         state, _ = lapack.dpbtrs(self.cholesky_factor, right_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
-    def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
+    def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
         """Return the whitened intervals, and the right-hand side of the normal equations."""
         i00, i01, _ = self.inverse_q
         # Cholesky factor U of Q⁻¹ = UᵀU
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        whitened_0 = u00 * dp + u01 * dv
-        whitened_1 = self.inverse_sqrt_q11 * dv
-        g0 = u00 * whitened_0
-        g1 = u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
+        whitened = np.empty((*dp.shape, 2))
+        whitened[..., 0] = u00 * dp + u01 * dv
+        whitened[..., 1] = self.inverse_sqrt_q11 * dv
+        g0 = u00 * whitened[..., 0]
+        g1 = u01 * whitened[..., 0] + self.inverse_sqrt_q11 * whitened[..., 1]
         right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.state_count))
         right_side[..., 1:, 0] = g0
         right_side[..., 1:, 1] = g1
@@ -445,11 +467,11 @@ class BandedSystem:
         g0 *= self.length_s
         g0 += g1
         right_side[..., :-1, 1] -= g0
-        if measured_m.any():
-            weighted_m = self.precision[:, 0] * measured_m
-            right_side[..., 0] += weighted_m
-            right_side[..., 2:] += weighted_m[..., None]
-        return (whitened_0, whitened_1), right_side.reshape(
+        weighted_m = self.precision[:, 0] * measured_m
+        measured_side = right_side[..., : measured_m.shape[-2], :, :]
+        measured_side[..., 0] += weighted_m
+        measured_side[..., 2:] += weighted_m[..., None]
+        return whitened.reshape(*dp.shape[:-1], -1), right_side.reshape(
             -1, self.state_count * len(self.precision)
         )
 

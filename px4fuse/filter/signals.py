@@ -7,7 +7,7 @@ force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -25,6 +25,9 @@ AISLE = "aisle"
 IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
 IMU_GAP_INTERVALS = 5.0
+# Maximum rate (Hz) of positions in estimates by likelihood: a faster source has time-correlated
+# errors, so more positions would add cost but no information
+MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
 
@@ -109,6 +112,14 @@ class Axis:
     acceleration: Acceleration | Unavailable
 
     __repr__ = one_line_repr
+
+    def keep(self, rows: slice) -> Axis:
+        """Return the axis with some of the measurements."""
+        return replace(
+            self,
+            measurement_time_s=self.measurement_time_s[rows],
+            measurement_m=self.measurement_m[rows],
+        )
 
     @property
     def label(self) -> str:
@@ -224,23 +235,26 @@ def make_axes(
                 f"{source_label} has no position along the axis {name} in the analysed segment."
             )
         projected_acceleration = project_acceleration(acceleration, direction, segment)
-        measured_times_and_positions = (
-            track_samples.index.to_numpy()[is_finite],
-            projected[is_finite],
-        )
         axes.append(
             Axis(
                 name,
                 direction,
                 heading,
                 note,
-                *measured_times_and_positions,
+                track_samples.index.to_numpy()[is_finite],
+                projected[is_finite],
                 projected_acceleration,
             )
         )
     if not axes:
         raise MissingDataError(f"{source_label} has no finite position in the analysed segment.")
     return tuple(axes)
+
+
+def independent_rows(time_s: Array) -> slice:
+    """Return every n-th measurement, at ``MAX_INDEPENDENT_HZ`` or a rate up to twice as high."""
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
+    return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_HZ))))
 
 
 def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:

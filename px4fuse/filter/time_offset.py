@@ -31,7 +31,7 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal_likelihood import products_by_segment
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, cut_to_segment
+from px4fuse.filter.signals import Segment, cut_to_segment, independent_rows
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets at which the likelihood is computed near its maximum
@@ -53,8 +53,9 @@ MIN_CHANGE_S = 0.10
 MIN_OFFSET_SIGMAS = 3.0
 # Minimum significant time offset (s): a position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
-# Number of simulated IMU noise series for the variance of the time offset
-SIMULATION_COUNT = 96
+# Number of simulated IMU noise series for the variance of the time offset, and number of segments
+# per sum; the sums of a longer flight are independent, so it needs fewer series
+SIMULATION_COUNT, SIMULATED_SEGMENTS = 96, 12
 
 
 class PartOffset(Record):
@@ -159,6 +160,7 @@ def estimate_time_offset(
     position_samples = position_samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         position_samples = position_samples[~np.isin(position_samples.index, outlier_time_s)]
+    position_samples = position_samples[independent_rows(position_samples.index.to_numpy())]
     prepared_motion = prepare_motion(
         flight,
         position_samples.index.to_numpy(),
@@ -256,12 +258,14 @@ def _simulate_variance_factor(
     axis_count = len(prepared_motion.directions)
     interval_count = int(np.count_nonzero(is_joined))
     rng = np.random.default_rng(measurement_count)
+    first_segments = np.arange(0, len(prepared_motion.signals), SIMULATED_SEGMENTS)
+    series_count = -(-SIMULATION_COUNT // len(first_segments))
 
     def draw_normal(size: int) -> Array:
-        return rng.standard_normal((size, axis_count, SIMULATION_COUNT)).transpose(1, 2, 0)
+        return rng.standard_normal((size, axis_count, series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.noise_unit[:, is_joined]
-    dp, dv = np.zeros((2, axis_count, SIMULATION_COUNT, measurement_count - 1))
+    dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
     dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
     dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
@@ -283,7 +287,8 @@ def _simulate_variance_factor(
     noise_products = products_by_segment(
         offset_positions, noises.sigma_a_m_s2, scaled_variance, (error_m, dp, dv), velocity_noise
     )
-    return 1.0 + float(np.var(noise_products.sum(axis=0))) / information
+    variances = np.add.reduceat(noise_products, first_segments).var(axis=1)
+    return 1.0 + float(variances.sum()) / information
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from px4fuse.filter.fitting import (
     Noises,
     filter_positions,
     maximise_likelihood,
+    outlier_probability,
 )
 from px4fuse.filter.imu_motion import SignalCache, prepare_motion
 from px4fuse.filter.likelihood import (
@@ -33,7 +34,7 @@ from px4fuse.filter.likelihood import (
     profile_ends,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, too_few_measurements
+from px4fuse.filter.signals import Axis, independent_rows, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
@@ -204,13 +205,15 @@ def tune_axes(
     signal_cache: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
-    axis_intervals = [preintegrate(axis, settings) for axis in axes]
-    measurement_count = len(axis_intervals[0].measurement_m)
+    all_intervals = [preintegrate(axis, settings) for axis in axes]
+    all_time_s = axes[0].measurement_time_s[-len(all_intervals[0].measurement_m) :]
+    axes = tuple(axis.keep(independent_rows(axis.measurement_time_s)) for axis in axes)
+    axis_positions = [filter_positions(preintegrate(axis, settings)) for axis in axes]
+    measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
         return too_few_measurements(
             f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
         )
-    axis_positions = [filter_positions(interval_input) for interval_input in axis_intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(measurement_count))
     # fit with biases, tilt and time offset; None without IMU data
@@ -241,6 +244,9 @@ def tune_axes(
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
+    if len(all_time_s) > measurement_count:
+        all_positions = [filter_positions(interval_input) for interval_input in all_intervals]
+        is_outlier = outlier_probability(all_positions, kf_fit, len(all_time_s)) > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             f"estimate of the noises ({name})",
@@ -264,12 +270,12 @@ def tune_axes(
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
         log_likelihood_gain_per_measurement=gain_nats / measurement_count,
-        before=_assess_innovations(axis_intervals[0], chosen_noises, is_outlier),
-        after=_assess_innovations(axis_intervals[0], final_noises, is_outlier),
-        outlier_time_s=axes[0].measurement_time_s[-measurement_count:][is_outlier],
-        count=measurement_count,
+        before=_assess_innovations(all_intervals[0], chosen_noises, is_outlier),
+        after=_assess_innovations(all_intervals[0], final_noises, is_outlier),
+        outlier_time_s=all_time_s[is_outlier],
+        count=len(all_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, axis_intervals, chosen_noises, kf_fit),
+        held_out=_check_held_out(name, chosen_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
     )
@@ -327,9 +333,7 @@ def _assess_innovations(
     return assess(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_held_out(
-    name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
-) -> HeldOutCheck | Unavailable:
+def _check_held_out(name: str, chosen_noises: Noises, fit: NoiseFit) -> HeldOutCheck | Unavailable:
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -338,22 +342,20 @@ def _check_held_out(
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    first_half = [
-        filter_positions(interval_input.first_measurements(half_count))
-        for interval_input in intervals
-    ]
+    # row 0 is KF's initial state
+    first_half = [positions.first(1 + half_count) for positions in fit.score.axis_positions]
     first_fit = maximise_likelihood(
         first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
     )
     tuned_noises = first_fit.noises
     # -ln p of the second half
-    second_half_scores = [
+    chosen_score, tuned_score = (
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
-    ]
-    second_half_count = len(fit.weight) - half_count
+    )
+    count = len(fit.weight) - half_count
     return HeldOutCheck(
         tuned_noises.sigma_a_m_s2,
         tuned_noises.sigma_z_m,
-        second_half_count,
-        (second_half_scores[0] - second_half_scores[1]) / second_half_count,
+        count,
+        (chosen_score - tuned_score) / count,
     )

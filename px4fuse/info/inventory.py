@@ -52,7 +52,7 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Samples that each analysis of px4fuse compare needs, by the name of the analysis
+# Samples that each analysis of px4fuse compare needs
 SAMPLES_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's variances",
@@ -65,7 +65,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse, with the data that it uses or the reason why it is not possible."""
+    """Analysis that px4fuse offers; ``reason`` states its data, or why it is not possible."""
 
     name: str
     possible: bool
@@ -74,7 +74,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Action before the next flight, and the analyses or data that the action makes possible."""
+    """Action before the next flight, and the analyses or data that it makes possible."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -92,7 +92,7 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Source:
-    """One kind of data in a flight with topics, rate and gaps, or the reason why it is missing.
+    """Kind of data in a flight with topics, rate and gaps, or the reason why it is missing.
 
     Attributes
     ----------
@@ -159,15 +159,17 @@ class Inventory:
 
 def take_inventory(flight: Flight) -> Inventory:
     """List the contents of a flight, the possible analyses and the advice on logging."""
-    comparison, reason, remedy = None, "", ""
+    comparison, reason, position_remedy = None, "", ""
     try:
         comparison = prepare(flight, ComparisonRequest(log=flight.log.name), as_sent=True)
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
-        remedy = with_options(error.remedy)
+        position_remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
-            remedy = "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
+            position_remedy = (
+                "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
+            )
     if comparison is not None:
         flight = select_innovations(flight, comparison.source)
     log = flight.log
@@ -178,8 +180,8 @@ def take_inventory(flight: Flight) -> Inventory:
         sources=tuple(_list_sources(flight, comparison, reason)),
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
-        abilities=tuple(_list_options(flight, comparison, reason)),
-        advice=_logging_advice(flight, comparison, remedy),
+        abilities=tuple(_list_analyses(flight, comparison, reason)),
+        advice=_logging_advice(flight, comparison, position_remedy),
         notes=(
             *log.damage,
             *["the log ends in flight and does not contain the landing"] * is_incomplete,
@@ -266,7 +268,7 @@ def _make_source(
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
-    """Measure intervals longer than 0.1 s (IMU) or 1 s, and than five median intervals."""
+    """Measure sample intervals above five median intervals and above 0.1 s (IMU) or 1 s."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals_s)))
@@ -282,7 +284,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     )
 
 
-def _list_options(
+def _list_analyses(
     flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
     if comparison is None:
@@ -295,8 +297,8 @@ def _list_options(
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
         )
         yield AnalysisOption("compare", True, description)
-    findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
-    imu_reason = " ".join(finding.message for finding in findings)
+    low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
+    imu_reason = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
         imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
@@ -311,15 +313,15 @@ def _list_options(
             for name, aid in results_by_aid.items()
         )
         description = ", ".join(rates)
-    yield _make_option("aids", results_by_aid, description)
+    yield _make_analysis_option("aids", results_by_aid, description)
     inputs, description = prepare_inputs(flight), ""
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay of {replayed_s:.0f} s with {inputs.aid.label}"
-    yield _make_option("what-if", inputs, description)
+    yield _make_analysis_option("what-if", inputs, description)
 
 
-def _make_option(name: str, data: object, description: str) -> AnalysisOption:
+def _make_analysis_option(name: str, data: object, description: str) -> AnalysisOption:
     if isinstance(data, Unavailable):
         return AnalysisOption(name, False, data.reason)
     return AnalysisOption(name, True, description)
@@ -332,32 +334,36 @@ def _analyses_against_ekf2_and_truth(
     data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
-        main_line, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
-        state, variance, truth = project_tracks(
-            ekf2, comparison.flight.truth, main_line, segment
-        ).values()
+        main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
+        projected_tracks = project_tracks(ekf2, comparison.flight.truth, main_axis, segment)
+        ekf2_state, ekf2_variance, truth = projected_tracks.values()
         innovations = (
             ekf2
             if isinstance(ekf2, Unavailable)
-            else project_innovations(flight, ekf2, comparison.source, main_line, segment)
+            else project_innovations(flight, ekf2, comparison.source, main_axis, segment)
         )
         data_by_analysis = dict(
-            zip(data_by_analysis, (state, variance, innovations, truth), strict=True)
+            zip(data_by_analysis, (ekf2_state, ekf2_variance, innovations, truth), strict=True)
         )
     for name, data in data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
         count = f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
-        yield _make_option(name, NO_COMPARISON if comparison is None and has_data else data, count)
+        yield _make_analysis_option(
+            name, NO_COMPARISON if comparison is None and has_data else data, count
+        )
 
 
 def _logging_advice(
-    flight: Flight, comparison: PreparedComparison | None, remedy: str
+    flight: Flight, comparison: PreparedComparison | None, position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the actions of findings on the recording and of missing data, each action once."""
+    """Collect the actions against faults of the recording and missing data, each action once.
+
+    ``position_remedy`` is the action if there is no position source.
+    """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
-    actions_and_purposes = [(remedy, "position")] if remedy else []
+    actions_and_purposes = [(position_remedy, "position")] if position_remedy else []
     if comparison is not None:
         findings += [
             *missing.detect_source_not_logged(comparison),
@@ -368,7 +374,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # other data are missing in every MAVLink recording, so advice on them is for ULogs only
+    # a MAVLink recording can contain only these data and positions
     mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)

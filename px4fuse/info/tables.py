@@ -40,11 +40,11 @@ NO_POSITION = Unavailable(
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Exported table, and the rows of the data dictionary that describe its columns."""
+    """Exported table, and the rows of the data dictionary on its columns."""
 
     name: str
     data: pd.DataFrame
-    columns: pd.DataFrame
+    column_descriptions: pd.DataFrame
 
 
 def with_source_innovations(flight: Flight) -> Flight:
@@ -65,21 +65,21 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
     """Return the data dictionary (:data:`DICTIONARY_COLUMNS`), with one row per table column."""
-    descriptions = [table.columns for table in _described_tables(flight)]
+    descriptions = [table.column_descriptions for table in _described_tables(flight)]
     if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
     return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
 
 
 def to_bytes(table: pd.DataFrame, file_format: str) -> bytes:
-    """Encode a table as Parquet or CSV; pandas writes enough digits to read equal numbers again."""
+    """Encode a table as Parquet or CSV; pandas writes numbers without rounding."""
     if file_format == "parquet":
         return table.to_parquet(engine="pyarrow", index=False)
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 
 def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
-    """List the missing data of a flight, which have no table, with the reasons."""
+    """List the data that a flight lacks, with the reasons."""
     ekf2 = flight.ekf2
     flight_data: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -112,7 +112,7 @@ def description(flight: Flight) -> dict[str, Any]:
 
 
 @cache
-def _column_descriptions() -> pd.DataFrame:
+def _read_column_descriptions() -> pd.DataFrame:
     """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
     lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
     for placeholder, names in PLACEHOLDER_NAMES.items():
@@ -136,14 +136,17 @@ def _describe_table(
     ``placeholder_values`` replace the names in braces in columns.csv.
     """
     tables_in_csv = ["any table"] * ("time_s" in data) + [name_in_csv or name]
-    columns = (
-        _column_descriptions()
+    column_descriptions = (
+        _read_column_descriptions()
         .loc[tables_in_csv]
         .map(lambda cell: cell.format(**placeholder_values))
     )
     topics, clock = topics_and_clock
-    columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
-    return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
+    column_descriptions = column_descriptions.assign(
+        table=name, source_topic=" ".join(topics), clock=clock
+    )
+    described_data = data.reindex(columns=column_descriptions["column"].tolist())
+    return DescribedTable(name, described_data, column_descriptions)
 
 
 def _stream_table(
@@ -162,22 +165,28 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
     yield from _stream_table(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
-        data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
+        acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
         imu_topics, clock = _topics_and_clock(flight, "imu")
         attitude_topics, _ = _topics_and_clock(flight, "attitude")
         yield _describe_table(
-            "acceleration_ned", _with_time_column(data), ((*imu_topics, *attitude_topics), clock)
+            "acceleration_ned",
+            _with_time_column(acceleration),
+            ((*imu_topics, *attitude_topics), clock),
         )
     for name, track in _named_tracks(flight):
         placeholder_values = {"frame": track.frame, "description": track.description}
         topics_and_clock = (track.topics, track.clock)
-        data = _with_time_column(track.samples)
-        yield _describe_table(name, data, topics_and_clock, "position", **placeholder_values)
+        position_table = _with_time_column(track.samples)
+        yield _describe_table(
+            name, position_table, topics_and_clock, "position", **placeholder_values
+        )
         if track.orientation is not None:
-            orientation_name = name.replace("position_", "orientation_", 1)
-            data = _with_time_column(track.orientation)
             yield _describe_table(
-                orientation_name, data, topics_and_clock, "orientation", **placeholder_values
+                name.replace("position_", "orientation_", 1),
+                _with_time_column(track.orientation),
+                topics_and_clock,
+                "orientation",
+                **placeholder_values,
             )
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2_tables(flight, flight.ekf2)
@@ -196,12 +205,12 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
         )
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
-        # the column must be float, because distinct_stamps is NaN for a usable clock
+        # float, because distinct_stamps is NaN for a clock that was mapped
         yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
-    """Return the PX4 parameters that the log, the EKF2 replay and the aiding sources use."""
+    """Return the logged values of the PX4 parameters for logging and fusion."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -241,10 +250,10 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name that is unique, also without regard to case."""
+    """Yield each position track with a table name that is unique even in lower case."""
     used_names: set[str] = set()
     for track in flight.positions:
-        # with the prefix, no name is one that Windows reserves (con, aux, ...)
+        # the prefix avoids names that Windows reserves (con, aux, ...)
         stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_TABLE_NAME_LENGTH].rstrip(
             "_"
         )

@@ -2,11 +2,10 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import Rows, decode_text, line_error, quote
@@ -65,9 +64,8 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     dimension, tag_kind, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(tag_kind):
-            raise rows.row_error(
-                0, "the file contains SE2 and SE3 poses", "Use only SE2 or only SE3."
-            )
+            fault = "the file contains SE2 and SE3 poses"
+            raise rows.row_error(0, fault, "Use only SE2 or only SE3.")
     vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
     edges = rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
@@ -163,18 +161,16 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
     return rows_by_tag
 
 
-def _parse_rows(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
+def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
     """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines with one tag."""
     vertex_count, value_count = _COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
-    is_invalid_id = np.array(
-        [
-            _VERTEX_ID.fullmatch(word) is None or abs(int(word)) > _MAX_VERTEX_ID
-            for word in cells[:, 1:].flat
-        ]
-    )
+    is_invalid_id = [
+        _VERTEX_ID.fullmatch(word) is None or abs(int(word)) > _MAX_VERTEX_ID
+        for word in cells[:, 1:].flat
+    ]
     rows.raise_where(
-        is_invalid_id.reshape(-1, vertex_count),
+        np.reshape(is_invalid_id, (-1, vertex_count)),
         "a vertex id is not a 64-bit integer",
         "Give an integer as vertex id.",
     )

@@ -22,6 +22,7 @@ from px4fuse.core.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
 Int64Array = NDArray[np.int64]
+ByteArray = NDArray[np.uint8]
 # Address of a sender: MAVLink system id and component id
 Address = tuple[int, int]
 
@@ -70,11 +71,11 @@ class Frames:
     # Offset of each frame's first byte in the content
     start: Int64Array
     message_id: NDArray[np.int32]
-    system: NDArray[np.uint8]
-    component: NDArray[np.uint8]
-    sequence: NDArray[np.uint8]
+    system: ByteArray
+    component: ByteArray
+    sequence: ByteArray
     payload_start: Int64Array
-    payload_length: NDArray[np.uint8]
+    payload_length: ByteArray
     # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
     received_us: Int64Array | None
     # Number of complete frames with messages that are not in the dialect
@@ -228,7 +229,7 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 
 
 def _find_possible_frames(
-    content_bytes: NDArray[np.uint8], block_start: int
+    content_bytes: ByteArray, block_start: int
 ) -> tuple[Int64Array, Int64Array]:
     """Return start, end and message id of possible frames in a block, and checksum offsets."""
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
@@ -313,7 +314,7 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 
 
 def _read_receive_times(
-    content_bytes: NDArray[np.uint8], start: Int64Array, end: Int64Array
+    content_bytes: ByteArray, start: Int64Array, end: Int64Array
 ) -> tuple[Int64Array, int]:
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start >= RECEIVE_TIME_BYTES

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from px4fuse.core.arrays import IntArray
 from px4fuse.errors import SettingsError
@@ -17,7 +16,7 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames, Int64Array
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
 # Maximum number of senders that are read and described: the senders with the most messages
@@ -173,7 +172,7 @@ def _map_sender_clock(
     )
 
 
-def _requests_of_other_senders(recording: Recording, sender: Address) -> NDArray[np.int64]:
+def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Array:
     """Return the field ``ts1`` of the TIMESYNC requests of all other senders."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")

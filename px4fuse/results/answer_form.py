@@ -1,6 +1,6 @@
-"""Answer form in which a student names the injected faults of a flight: questions, and reading.
+"""Writing and reading of the answer form, in which a student names the faults of a flight.
 
-``form.toml`` lists the allowed answers. Reading checks the syntax, not whether answers are right.
+Reading checks that the answers are allowed (``form.toml``), not whether they are right.
 """
 
 import hashlib
@@ -26,11 +26,12 @@ MAX_FORM_BYTES = 20_000
 MAX_LINE_LENGTH = 500
 MAX_MISTAKES = 20
 NO_MISTAKE_KIND = "none"
+# Text of a table cell for an answer left blank
 EMPTY_CELL = "\u2013"
 
 
 class MistakeKind(Record, rename={"size_quantity": "in"}):
-    """Injected fault that a student can name, with the quantity of its size.
+    """Kind of fault that a student can name, with the quantity of its size.
 
     ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
     """
@@ -42,25 +43,27 @@ class MistakeKind(Record, rename={"size_quantity": "in"}):
     @property
     def units(self) -> Mapping[str, float]:
         """Factors that convert each unit of the size to the first unit; empty without a size."""
-        return _UNITS[self.size_quantity]
+        return _UNITS_BY_QUANTITY[self.size_quantity]
 
 
-class FormChoices(Record):
-    """Allowed answers of the answer form (``form.toml``), and new names of old answers."""
+class AllowedAnswers(Record, rename={"new_by_old_name": "renamed"}):
+    """Allowed answers of the answer form (``form.toml``), and new names of former answers."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
     mistakes: dict[str, MistakeKind]
     corrections: dict[str, str]
-    renamed: dict[str, str]
+    new_by_old_name: dict[str, str]
 
 
-_CHOICES = read_toml(__file__, FormChoices, "form.toml")
-_UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
-MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
+_ALLOWED = read_toml(__file__, AllowedAnswers, "form.toml")
+_UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED.units}
+MISTAKES, EKF2_BEHAVIOURS, PANELS = _ALLOWED.mistakes, _ALLOWED.behaviours, _ALLOWED.panels
 # Units of the value of a correction (empty without a value), by name of the correction
-CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
+CORRECTIONS = {
+    name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED.corrections.items()
+}
 # Verdict on a filter without innovations
 NOT_AVAILABLE = "not available"
 
@@ -70,7 +73,7 @@ VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not 
 VERDICTS = get_args(VerdictWord)[1:]
 ChoiceName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
-# Description of the accepted values of a text field of the answer form, by field name
+# Description of the accepted values of a field of the answer form, by field name
 ACCEPTED_VALUES = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or an empty text with the times from_s and until_s',
@@ -79,29 +82,29 @@ ACCEPTED_VALUES = {
     "log_sha256": "the SHA-256 of the log, which px4fuse answers writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
-# Answer to a question about KF: a number, a list of update numbers, or None if left blank
+# Answer to a question about KF: a number, the numbers of KF updates, or None if left blank
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-# Letters of the answers from which the student chooses
+# Letters of the answers to a multiple-choice question
 CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
 MAX_CHOICES = 20
 CHOICES_HEAD = """
 # Figures: the picture of the same name (.png) shows flights with other faults, analysed with
-# SIGMA_A 0.5 and SIGMA_Z 0.1. The vehicle flies in the direction of the aisle in grey times. Give
-# the letter of the right answer. A wrong letter costs a quarter of the points of a right letter.
+# SIGMA_A 0.5 and SIGMA_Z 0.1. The background is grey while the vehicle flies in the direction of
+# the aisle, and white otherwise. Give the letter of the right answer. A wrong letter costs a
+# quarter of the points of a right letter.
 [choices]
 """
 
 
 class Choice(Record):
-    """Question about a figure, with five answers: the student chooses one."""
+    """Multiple-choice question about a figure."""
 
     question: str
     options: tuple[str, ...]
 
     def answer_text(self, letter: str) -> str:
-        """Return the text of an answer by its letter."""
         return self.options[CHOICE_NAMES.index(letter)]
 
     @property
@@ -111,10 +114,11 @@ class Choice(Record):
 
 
 class StudentMistake(Record):
-    """Injected fault of a flight that a student names in the answer form.
+    """Fault that a student names in the answer form.
 
-    ``from_s`` and ``until_s`` are times since the first data. ``parameter`` is a correction with a
-    ``value``, and ``panel`` the part of the report that shows the fault.
+    ``from_s`` and ``until_s`` are its start and end (s since the first data). ``parameter`` is the
+    correction of the fault, with the new ``value``. ``panel`` is the part of the report that shows
+    the fault.
     """
 
     kind: str
@@ -129,7 +133,7 @@ class StudentMistake(Record):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Convert the size to the first unit of the fault, such as a factor of 1.05 to 5 %."""
+        """Convert the size to the first unit in ``form.toml``, as a factor of 1.05 to 5 %."""
         units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
@@ -138,7 +142,7 @@ class StudentMistake(Record):
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
     def value_in_first_unit(self) -> float | None:
-        """Convert the value of the correction to the first unit of its parameter, cm to m."""
+        """Convert the value of the correction to the first unit in ``form.toml``, as cm to m."""
         units = CORRECTIONS.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -153,9 +157,10 @@ class Answers(Record, kw_only=True):
     ekf2_did : tuple of str
         Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
-        Answers to :func:`draw_questions`; for the gate, the numbers of the updates outside it.
+        Answers to the questions of :func:`draw_questions`; for the question about the innovation
+        gate, the numbers of the KF updates with an innovation outside the gate.
     choices : tuple of str
-        Letter that the student chose for each :class:`Choice`; "" if left blank.
+        Letter that the student chose for each question about a figure; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -173,7 +178,7 @@ class Answers(Record, kw_only=True):
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Kinds of the three questions of a form: one of each pair is drawn at random
+# Kinds of the three questions of an answer form: one kind of each pair is selected at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -182,12 +187,12 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record):
-    """Question about KF along the main axis, which the student answers with an own filter.
+    """Question about KF along the main axis, which the student answers with a self-written filter.
 
     Attributes
     ----------
     update : int
-        Number of the KF update, from 1; the first measurement sets the state and is not counted.
+        Number of the KF update, from 1. The first measurement sets the state and has no number.
     duration_or_gate : float
         For the kind "prediction" the time without measurement (s), for "gate" the gate (in √S).
     """
@@ -206,19 +211,19 @@ class FormQuestion(Record):
             "variance": f"position variance after update {update} (m²)",
             "innovation": f"innovation of update {update} (m)",
             "nis": f"NIS of update {update}",
-            "prediction": f"position sigma (m) {number} s after update {update}, no measurement",
+            "prediction": f"position sigma (m) {number} s after update {update}, no further update",
             "gate": f"list of the updates {update} to {update + GATE_QUESTION_UPDATES} with an "
-            f"innovation outside {number} sqrt(S); KF uses these updates, too",
+            f"innovation outside {number} sqrt(S); KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of the KF updates after the first update in a question about the innovation gate
+# Number of KF updates in a question about the innovation gate, without the first one
 GATE_QUESTION_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Draw three questions about KF at random, with the SHA-256 of the log as seed."""
+    """Select three questions about KF at random, with the SHA-256 of the log as seed."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def draw_between(low: float, high: float, decimals: int) -> float:
@@ -258,7 +263,7 @@ def read_answers(path: Path) -> Answers:
 
 
 def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
-    """Describe the invalid answer and the accepted values, or the line that is not TOML."""
+    """Describe the invalid answer with the accepted values, or the line that is not TOML."""
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
         line = line_match[1]
@@ -308,8 +313,8 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_renamed_values(value: Any) -> Any:
-    """Replace names and values of answer forms and answer keys written before schema version 4."""
-    return convert_nested(value, lambda element: _CHOICES.renamed.get(element, element))
+    """Rename fields and values of answer forms and answer keys from before schema version 4."""
+    return convert_nested(value, lambda element: _ALLOWED.new_by_old_name.get(element, element))
 
 
 def _without_blanks(value: Any) -> Any:
@@ -321,7 +326,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def check_answers(answers: Answers) -> None:
-    """Raise ValueError if an answer is not allowed, out of range, or names a fault twice."""
+    """Raise ValueError if an answer is not allowed or out of range, or a fault is repeated."""
     kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)
@@ -334,20 +339,20 @@ def check_answers(answers: Answers) -> None:
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for student_mistake in answers.mistakes:
-        mistake = MISTAKES[student_mistake.kind]
+        fault_kind = MISTAKES[student_mistake.kind]
         for field, choices in (
             ("parameter", CORRECTIONS),
             ("panel", PANELS),
-            ("unit", mistake.units),
+            ("unit", fault_kind.units),
             ("value_unit", CORRECTIONS.get(student_mistake.parameter)),
         ):
             chosen_name = getattr(student_mistake, field)
             if chosen_name and choices is not None:
                 _require_choice(f"{student_mistake.kind}: {field}", chosen_name, choices)
-        low, high = mistake.range
+        low, high = fault_kind.range
         size = student_mistake.size_in_first_unit()
         if size is not None and not low <= size <= high:
-            unit = next(iter(mistake.units))
+            unit = next(iter(fault_kind.units))
             raise ValueError(
                 f"{student_mistake.kind}: size {size:g} is out of range ({low:g} to {high:g} "
                 f"{unit})"
@@ -370,15 +375,15 @@ def form_name(log_name: str) -> str:
 
 
 def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
-    """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
+    """Return an empty answer form (TOML) for a log, with all allowed answers in comments."""
     template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
         for number, question in enumerate(draw_questions(log_sha256), start=1)
     ]
-    kinds = (
-        f"{name:13} {mistake.description}{_format_units(mistake.units)}"
-        for name, mistake in MISTAKES.items()
+    kind_lines = (
+        f"{name:13} {kind.description}{_format_units(kind.units)}"
+        for name, kind in MISTAKES.items()
     )
     return Template(template).substitute(
         log=log_name,
@@ -386,7 +391,7 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
         sha256=log_sha256,
         verdicts=_join_quoted(VERDICTS),
         behaviours=_format_block(_format_in_threes(EKF2_BEHAVIOURS)),
-        kinds=_format_block(kinds),
+        kinds=_format_block(kind_lines),
         corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
         panels=_format_block(_format_in_threes(PANELS)),
         questions="\n".join(questions),
@@ -397,7 +402,7 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
-    """Yield question and answer of each row of a completed form, for the PDF and the class page."""
+    """Yield the questions of an answer form with the student's answers as texts."""
     yield "Verdict on KF", answers.verdict_kf or EMPTY_CELL
     yield "Verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL

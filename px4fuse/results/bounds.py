@@ -1,7 +1,4 @@
-"""Bounds of the numbers in results: a number outside its bounds is replaced by a reason.
-
-The bounds depend on the name of a field, which contains quantity and unit.
-"""
+"""Bounds of the numbers in results, by the name of their field, which has quantity and unit."""
 
 import math
 import re
@@ -15,7 +12,7 @@ from msgspec.structs import fields, replace
 from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
 
-# Maximum absolute value of a length (m), and of a ratio, in the results of a flight
+# Maximum absolute value of a length (m), and of a ratio, in results
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
 # Minimum and maximum of a number by pattern of its field name; the first match applies
 BOUNDS = {
@@ -30,11 +27,11 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class _OutOfBoundsError(Exception):
-    """A number in results is outside its bounds; the text contains the path of the number."""
+    """Number in results outside its bounds; the message contains the path of the number."""
 
 
 def bounds_of(name: str) -> tuple[float, float]:
-    """Return minimum and maximum of a number in results from the name of its field.
+    """Return minimum and maximum of the numbers in a field of results, by name of the field.
 
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
@@ -46,8 +43,8 @@ def bounds_of(name: str) -> tuple[float, float]:
 def within_bounds(results: T) -> T:
     """Remove numbers outside their bounds from results.
 
-    An optional number is omitted. If a required number is outside its bounds, its record is omitted
-    or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes`` of the results.
+    An optional number is set to None. For a required number, the record that contains it is
+    deleted or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes``.
 
     Raises
     ------
@@ -125,7 +122,7 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # one number outside its bounds omits the whole tuple of numbers (a vector)
+    # a vector is deleted as a whole if one of its numbers is outside its bounds
     checked_elements = []
     for element in value:
         try:
@@ -138,7 +135,7 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
 
 
 def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
-    """Check a value; an Unavailable replaces it if a number is outside its bounds."""
+    """Return the value, or an Unavailable if it contains a number outside its bounds."""
     try:
         return _check_value(value, annotation, path, reasons)
     except _OutOfBoundsError as error:

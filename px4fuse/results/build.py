@@ -1,4 +1,4 @@
-"""Conversion of analyses to the results that px4fuse writes as JSON."""
+"""Conversion of analyses to the JSON results."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -36,14 +36,13 @@ def results(
 ) -> contract.ComparisonResults:
     """Return the results of ``px4fuse compare`` on a flight with positions for KF.
 
-    The diagnosis on an assigned flight is replaced by the student's answers.
+    For an assigned flight, the card shows the student's answers instead of the diagnosis.
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
-        question_rows = form_rows(student.answers)
         texts = (
-            f"{label}: {answer_text}"
-            for label, answer_text in question_rows
+            f"{question}: {answer_text}"
+            for question, answer_text in form_rows(student.answers)
             if answer_text != EMPTY_CELL
         )
         card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
@@ -102,7 +101,7 @@ def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract
             **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
             agreement=summaries.agreement,
             evaluated_s=summaries.evaluated_s,
-            asked=analysis.uses_estimates,
+            uses_estimates=analysis.uses_estimates,
             logged=summaries.logged,
             replayed=summaries.replayed,
             whatif=summaries.whatif[0] if sweep_start_index else None,
@@ -150,7 +149,6 @@ def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
 
 
 def log_record(flight: Flight) -> Log:
-    """Return the description of a flight's log, with other input files and clocks."""
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 

@@ -1,7 +1,7 @@
-"""Types of the results: one JSON object per command, with JSON Schema and writing.
+"""Types of the results (one JSON object per command), their JSON Schema, and writing.
 
-px4fuse reads results whose schema has the same major version; fields of a newer minor version are
-ignored.
+px4fuse reads results with the same major version of the schema, and ignores fields that a newer
+minor version has added.
 """
 
 import json
@@ -45,7 +45,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Log of a flight, with its other input files and the clocks mapped to the boot clock."""
+    """Log of a flight, its further input files, and the clocks mapped to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
@@ -62,9 +62,9 @@ class AvailableTrack(Record):
 class PositionSource(Record, kw_only=True):
     """Position source with which KF and EKF2 are compared.
 
-    ``kind`` is the type of sensor, and ``path`` states how the positions reached the log.
-    ``ekf2_parameters`` are the logged EKF2 parameters of the source, by PX4 name and in PX4's
-    units. ``log`` is the name of the file that contains the positions.
+    ``kind`` is the type of sensor, and ``path`` how the positions reached the log.
+    ``ekf2_parameters`` are the logged EKF2 parameters for this source, in units of PX4. ``log`` is
+    the name of the file that contains the positions.
     """
 
     name: str
@@ -97,17 +97,17 @@ class ChosenSettings(Record, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning with the maximum-likelihood estimate, by KF setting
+# Field of AxisTuning that contains the maximum-likelihood estimate of a KF setting
 ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 DiffSide = Literal["A", "B"]
-# 95 % interval; the upper end is None if there is no upper bound
+# 95 % interval; the upper bound is None if the data do not limit it
 Interval = tuple[float, float | None]
 
 
 class DiffInput(Record, kw_only=True):
-    """Input A or B of ``px4fuse diff``: file name (``given``), and the log of its results."""
+    """Input A or B of ``px4fuse diff``: file name (``given``), and the analysed log."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -117,10 +117,10 @@ class DiffInput(Record, kw_only=True):
 
 
 class NumberChange(Record, kw_only=True):
-    """Number that differs between the inputs A and B, with 95 % intervals if there are any.
+    """Number that differs between the inputs A and B of ``px4fuse diff``, with 95 % intervals.
 
     ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
-    "share" is a fraction from 0 to 1. ``a`` or ``b`` is absent if only one input has the number.
+    "share" is a fraction from 0 to 1. ``a`` or ``b`` is None if that input lacks the number.
     """
 
     path: str
@@ -165,7 +165,7 @@ class ComparisonResults(_FlightResults):
     Attributes
     ----------
     tuning : mapping of axis name to AxisTuning
-        "horizontal" stands for north and east together.
+        The key "horizontal" is one estimate for the axes north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Ekf2Replay
@@ -175,10 +175,10 @@ class ComparisonResults(_FlightResults):
     trials : tuple of Trial
         Re-runs of both filters, each with one change.
     card : Card
-        Diagnosis that cover, terminal, web page and batch table show.
+        Summary of the diagnosis, on cover, terminal, web page and batch table.
     convention : Convention
-        Axes, unit, clock and orientation of the source as sent. Absent for GNSS, and without IMU or
-        attitude.
+        Axes, unit, clock and orientation of the positions as sent. None for GNSS, and for a log
+        without IMU or attitude.
     """
 
     axes: Annotated[dict[AxisName, AxisComparison], Meta(min_length=1)]
@@ -258,12 +258,12 @@ class EvaluationResults(Evaluation, kw_only=True):
     provenance: Provenance
 
 
-class WhatIfResults(Record, kw_only=True):
+class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the user gave no
-    parameters, so that ``whatif`` has the maximum-likelihood estimates. ``sweep`` has one summary
-    per value of the swept parameter.
+    All statistics are over the time spans ``evaluated_s``. ``uses_estimates`` is True if ``whatif``
+    has maximum-likelihood estimates, because the user gave no parameters. ``sweep`` has one summary
+    for each value of the swept parameter.
     """
 
     schema: Schema
@@ -271,7 +271,7 @@ class WhatIfResults(Record, kw_only=True):
     log: Log
     agreement: Agreement
     evaluated_s: tuple[Span, ...]
-    asked: bool
+    uses_estimates: bool
     logged: Summary
     replayed: Summary
     whatif: Summary | None = None
@@ -283,7 +283,8 @@ class WhatIfResults(Record, kw_only=True):
 class ChangeResults(Record, kw_only=True):
     """Results of ``px4fuse diff``: differences from A to B.
 
-    ``worse`` has one sentence for each verdict that is worse in B; the exit code is then 1.
+    ``worse`` has a sentence for each consistency verdict that is worse in B, and for each error
+    that only B has. The exit code is then 1.
     """
 
     schema: Schema
@@ -355,7 +356,7 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
         }
 
     count = 0
-    # repeated until describe adds no type from inside another type
+    # repeat until the schemas contain no further nested type
     while count < len(record_types):
         count = len(record_types)
         schemas, components = msgspec.json.schema_components(
@@ -373,8 +374,8 @@ def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
 def round_number(value: float) -> float:
     """Round a number to ten significant digits, or to six decimals if that is more precise.
 
-    UNIX times (s) need the six decimals. More digits depend on the processor, because linear
-    algebra libraries add in different orders.
+    UNIX times (s) need the six decimals. Further digits depend on the processor, because linear
+    algebra libraries sum in different orders.
 
     >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
     (0.3, 1795251250.202012)
@@ -391,7 +392,7 @@ def _to_builtin(value: Any) -> float | dict[str, Any]:
 
 
 def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
-    """Write results as JSON: stable order, rounded numbers, one trailing newline.
+    """Format results as JSON, with rounded numbers and a trailing newline.
 
     Raises
     ------
@@ -406,5 +407,5 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
 
 
 def file_hashes_in(text: str) -> list[str]:
-    """Return the SHA-256 of all input files that results (JSON text) contain, in order."""
+    """Return the SHA-256 of all input files in results (JSON text), in order of appearance."""
     return re.findall(r'"([0-9a-f]{64})"', text)

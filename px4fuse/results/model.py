@@ -1,4 +1,4 @@
-"""Records that results of several commands contain: schema, student and provenance."""
+"""Records in the results of several commands: schema, student and provenance."""
 
 import platform
 from importlib import metadata
@@ -48,7 +48,7 @@ class Provenance(Record):
     libraries : mapping of str to str
         Versions of the libraries that affect the numbers in the results.
     command : str
-        Command line for people; programs use the request, which has the same files and settings.
+        Command line for readers. Programs use the field ``request`` of the results instead.
     """
 
     px4fuse: Version

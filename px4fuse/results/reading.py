@@ -23,15 +23,11 @@ class _Schema(msgspec.Struct, frozen=True):
     version: str
 
 
-class _Writer(msgspec.Struct, frozen=True):
-    px4fuse: str = "of that schema version"
-
-
 class _Head(msgspec.Struct, frozen=True):
-    """Fields that results of all versions of the schema contain."""
+    """Fields of results in all schema versions."""
 
     schema: _Schema
-    provenance: _Writer = _Writer()
+    provenance: Any = None
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
@@ -63,10 +59,15 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         raise ResultsError(f"{name} contains no results of px4fuse.") from error
     version, (major, minor) = head.schema.version, SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        reader_version = one_line(head.provenance.px4fuse, 60)
+        writer = head.provenance.get("px4fuse") if isinstance(head.provenance, dict) else None
+        version_text = (
+            f"px4fuse {one_line(str(writer), 60)}"
+            if writer
+            else "the version that wrote the results"
+        )
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
-            f"Create the report again, or read it with px4fuse {reader_version}.",
+            f"Create the report again, or read it with {version_text}.",
         )
     if int(version.partition(".")[2]) > int(minor):
         decoded = _remove_unknown_fields(decoded, results_type)
@@ -82,7 +83,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 
 def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
-    """Remove fields that a newer minor version of the schema has added from decoded JSON."""
+    """Remove the fields that the schema of this version does not have from decoded JSON."""
     types = types_of(annotation)
     if isinstance(value, dict):
         record_types = [record for record in types if hasattr(record, "__struct_fields__")]
@@ -106,7 +107,6 @@ def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
 
 
 def _clean_value(value: Any) -> Any:
-    """Clean a text of decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
     if isinstance(value, str):
         return clean_text(value)
     if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:

@@ -165,30 +165,23 @@ def height_error(scenario: Scenario, time_s: Array) -> Array:
     return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
-def limit_rate(unlimited_topic: Topic, rate_hz: float) -> Topic:
+def limit_rate(full_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = True) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    times_s = seconds(time_us(unlimited_topic))
-    return _select_messages(unlimited_topic, keep_at_rate(times_s, rate_hz))
+    is_logged = keep_at_rate(seconds(time_us(full_topic)), rate_hz) & is_kept
+    logged_fields = {name: values[is_logged] for name, values in full_topic.fields.items()}
+    return Topic(full_topic.name, logged_fields)
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
-    times_s = seconds(time_us(full_topic))
-    is_outside_gap = _is_outside_gap(
-        times_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
-    )
-    return _select_messages(
-        full_topic, is_outside_gap & keep_at_rate(times_s, mistakes.imu_rate_hz)
-    )
+    times_s, gap = seconds(time_us(full_topic)), (mistakes.imu_dropout_s, mistakes.imu_dropout_at_s)
+    is_outside_gap = _is_outside_gap(times_s, *gap, motion.duration_s)
+    return limit_rate(full_topic, mistakes.imu_rate_hz, is_outside_gap)
 
 
 def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
     """Return the publication time (or another time) of each message, µs from the first data."""
     return np.asarray(topic.fields[field].astype(np.int64) - START_US)
-
-
-def _select_messages(topic: Topic, is_kept: BoolArray) -> Topic:
-    return Topic(topic.name, {name: values[is_kept] for name, values in topic.fields.items()})
 
 
 def measure_imu(
@@ -396,12 +389,11 @@ def outliers(
     gap_lengths = rng.multinomial(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
-    burst_starts = np.cumsum(gap_lengths[:-1]) + np.cumsum(burst_lengths) - burst_lengths
     burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    index_in_burst = np.arange(outlier_count) - np.repeat(
-        np.cumsum(burst_lengths) - burst_lengths, burst_lengths
-    )
-    outlier_indices = airborne_indices[burst_starts[burst_index] + index_in_burst]
+    # number of outliers and of other positions before each outlier
+    outlier_indices = airborne_indices[
+        np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
+    ]
     angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
     size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
     offset_m[outlier_indices, 0] = size_m * np.cos(angle_rad)

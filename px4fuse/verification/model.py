@@ -20,9 +20,10 @@ PageStatus = Literal["same", "differ", "not compared"]
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Value of a report that a new run of the analysis does not reproduce ("absent" if missing).
+    """Value in a report that a new run of the analysis does not reproduce.
 
-    ``path`` is the place in the results, such as ``axes.north.filters.kf.nis_mean``.
+    ``path`` is the place in the results, such as ``axes.north.filters.kf.nis_mean``. A missing
+    value is "absent".
     """
 
     path: str
@@ -34,8 +35,8 @@ class Mismatch:
 class PageDifference:
     """Difference between a submitted PDF and the report that px4fuse draws again.
 
-    ``page`` is 0 for the whole document. ``is_structural`` is True if PDF objects are added or
-    missing, which indicates that another program wrote the file.
+    ``page`` is 0 for the whole document. ``is_structural`` is True if the difference shows that
+    another program wrote the file, as added or missing PDF objects do.
     """
 
     page: int
@@ -57,9 +58,9 @@ class Verification:
         Sentences with the differences, the reason for "cannot verify", or the successful checks.
     with_log : bool
         True if the analysis was repeated on the log.
-    redrawn : bytes
-        PDF that px4fuse drew from the repeated analysis, to be read instead of the submitted PDF;
-        empty if the analysis was not repeated.
+    redrawn_pdf : bytes
+        Report from the repeated analysis, to be read instead of the submitted PDF; empty if the
+        analysis was not repeated.
     remedy : str
         Action of the user if the report was not verified.
     missing : str
@@ -72,7 +73,7 @@ class Verification:
     differences: tuple[Mismatch, ...] = ()
     page_status: PageStatus = "not compared"
     pages: tuple[PageDifference, ...] = ()
-    redrawn: bytes = field(default=b"", repr=False)
+    redrawn_pdf: bytes = field(default=b"", repr=False)
     remedy: str = ""
     missing: str = ""
 

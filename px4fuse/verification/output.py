@@ -13,36 +13,36 @@ from px4fuse.verification.verification import LIMIT_NOTE
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 
 
-def verdict_data(pdf: bytes, verdict: Verification) -> dict[str, object]:
+def verdict_data(pdf: bytes, verification: Verification) -> dict[str, object]:
     """Return the JSON output of ``px4fuse verify``."""
-    values = asdict(verdict)
-    for name in ("redrawn", "remedy", "missing"):  # only px4fuse grade uses these fields
+    values = asdict(verification)
+    for name in ("redrawn_pdf", "remedy", "missing"):  # only px4fuse grade uses these fields
         del values[name]
     return {
         "schema": SCHEMA,
         "report_sha256": hashlib.sha256(pdf).hexdigest(),
-        "outcome": verdict.outcome,
+        "outcome": verification.outcome,
         **values,
         "limit": LIMIT_NOTE,
     }
 
 
-def verdict_page(name: str, verdict: Verification, output: Path | None) -> Page:
+def verdict_page(name: str, verification: Verification, output: Path | None) -> Page:
     """Format the terminal output of ``px4fuse verify``."""
     page = Page()
     colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
-    colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
-    page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
-    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT_NOTE]
+    colour = colours.get(verification.outcome, SEVERITY_COLOURS["error"])
+    page.write(f"{one_line(name, 200)}: {verification.outcome}", bold=True, colour=colour)
+    sentences = [one_line(reason, 400) for reason in verification.reasons if reason != LIMIT_NOTE]
     sentences += [
         f"{difference.path}: report {difference.recorded}, re-computed {difference.recomputed}"
-        for difference in verdict.differences
+        for difference in verification.differences
     ]
     for sentence in sentences:
         page.write(sentence, indent=12.0)
-    if output is not None and not verdict.redrawn:
+    if output is not None and not verification.redrawn_pdf:
         page.write("No report was written with -o, because the analysis was not repeated.")
-    elif output is None and verdict.pages:
+    elif output is None and verification.pages:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."
         )

@@ -55,14 +55,15 @@ NUMBER_TOLERANCE = 1e-5
 # Maximum kerning (1/1000 em) of a text whose numbers may differ by rounding: a wider shift in a
 # submitted PDF could place digits in another order
 MAX_KERNING = 200.0
-# Maximum ratio of submitted to redrawn page content (bytes): PDF may write a character as four
-# bytes
+# Maximum ratio of submitted to redrawn page content (bytes): a PDF may escape a character with
+# four bytes
 MAX_CONTENT_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
+SECOND_TABLE = "the file has a second cross-reference table"
 # PDF dictionary keys that are not compared: programs that save a PDF again change the values
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
@@ -75,15 +76,15 @@ MAX_XMP_BYTES = 100_000
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
-    "/AA": "an action that runs automatically",
+    "/AA": "a PDF action that runs automatically",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
     "/CropBox": "a crop box",
     "/OCProperties": "layers",
-    "/OpenAction": "an action that runs automatically",
+    "/OpenAction": "a PDF action that runs automatically",
     "/Outlines": "bookmarks",
     "/Rotate": "a rotation",
-    "/UserUnit": "a unit of length other than the point",
+    "/UserUnit": "a page unit other than 1/72 inch",
     "/XObject": "an image or form object",
 }
 # Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
@@ -107,7 +108,7 @@ _ESCAPED_CHARACTERS = {
 # PDF drawing operators with coordinates, and index of the first coordinate among their operands
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
-# Entry of a font's ToUnicode map: glyph number and its characters (UTF-16), in hexadecimal digits
+# Entry of a font's ToUnicode map: glyph number and UTF-16 characters, in hexadecimal digits
 _TO_UNICODE_ENTRY = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
 TextComparison = Callable[[str, str], bool]
@@ -122,25 +123,28 @@ def compare_pages(
     """Compare a submitted PDF with the redrawn report, in a process with limits.
 
     ``is_same_text`` returns True if two texts are equal up to the rounding of a number. At most
-    MAX_LISTED_DIFFERENCES are returned, in page order. If the comparison exceeds its limits, this
-    is the only difference.
+    MAX_LISTED_DIFFERENCES are returned, in page order; only one if the comparison exceeds its
+    limits.
     """
     job = submitted_pdf, redrawn_pdf, is_same_text
     differences = run_one_with_limits(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")
-    return (PageDifference(0, f"the pages were not compared within the limits ({reason})", True),)
+    return (PageDifference(0, f"the pages could not be compared ({reason})", True),)
 
 
 def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
-    submitted, redrawn, is_same_text = job
+    submitted_bytes, redrawn_bytes, is_same_text = job
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
-            submitted_pdf, redrawn_pdf = map(open_strictly, (submitted, redrawn))
+            submitted_pdf, redrawn_pdf = map(open_strictly, (submitted_bytes, redrawn_bytes))
             page_differences = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
             differences = [
-                *(PageDifference(0, ambiguity, True) for ambiguity in _find_ambiguities(submitted)),
+                *(
+                    PageDifference(0, ambiguity, True)
+                    for ambiguity in _find_ambiguities(submitted_bytes)
+                ),
                 *islice(page_differences, MAX_LISTED_DIFFERENCES),
             ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
@@ -159,7 +163,7 @@ class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    # object number and generation in the submitted PDF, and object number in the redrawn PDF
+    # object number and generation in the submitted PDF, object number in the redrawn PDF
     compared_pairs: set[tuple[int, int, int]] = field(default_factory=set)
     # parents of pages in both PDFs, to be compared after the document catalogue
     parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
@@ -169,29 +173,29 @@ class _PdfComparison:
     value_count: int = 0
 
     def differences(
-        self, submitted: pypdf.PdfReader, redrawn: pypdf.PdfReader
+        self, submitted_pdf: pypdf.PdfReader, redrawn_pdf: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
-        pages = [_get_page_references(reader) for reader in (submitted, redrawn)]
+        pages = [_get_page_references(reader) for reader in (submitted_pdf, redrawn_pdf)]
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
                 description = "the page is missing"
                 if redrawn_page is None:
-                    description = f"px4fuse draws only {len(pages[1])} pages"
+                    description = f"the redrawn report has only {len(pages[1])} pages"
                 yield PageDifference(page_number, description)
                 return
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(submitted_page, redrawn_page, "/Page", page_number)
         for key in ("/Info", "/Root"):
             submitted_value, redrawn_value = (
-                dict.get(reader.trailer, key) for reader in (submitted, redrawn)
+                dict.get(reader.trailer, key) for reader in (submitted_pdf, redrawn_pdf)
             )
             yield from self._compare(submitted_value, redrawn_value, key, 0)
         for pair in self.parent_pairs:
             yield from self._compare(*pair, 0)
-        # programs that support PDF 1.4 and PDF 1.5 read different cross-reference tables
-        if "/XRefStm" in submitted.trailer:
-            yield PageDifference(0, "the file has a second table of objects", True)
+        # readers of PDF 1.4 and of PDF 1.5 use different cross-reference tables
+        if "/XRefStm" in submitted_pdf.trailer:
+            yield PageDifference(0, SECOND_TABLE, True)
 
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page: int
@@ -205,9 +209,8 @@ class _PdfComparison:
                 raise LimitReachedError("the PDF contains too many values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:  # some programs ignore generation numbers
-                    yield PageDifference(
-                        page, f"the PDF entry {key} refers to an object of a later generation", True
-                    )
+                    description = f"the PDF entry {key} refers to an object of generation above 0"
+                    yield PageDifference(page, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
                     if pair in self.compared_pairs:
@@ -304,9 +307,11 @@ class _PdfComparison:
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield PageDifference(page, description)
 
-    def _describe_operation_difference(self, submitted: bytes, redrawn: bytes) -> str:
+    def _describe_operation_difference(
+        self, submitted_content: bytes, redrawn_content: bytes
+    ) -> str:
         """Describe the first drawing operation of a page that differs; "" if there is none."""
-        operation_lists = map(_drawing_operations, (submitted, redrawn))
+        operation_lists = map(_drawing_operations, (submitted_content, redrawn_content))
         font_name = ""
         for operation_number, operations in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
@@ -360,7 +365,7 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
         # the end of the file must refer to the first cross-reference table
         table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[table_start : int(end_match[1])].strip():
-            yield "the file has a second table of objects"
+            yield SECOND_TABLE
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:

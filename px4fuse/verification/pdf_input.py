@@ -37,7 +37,7 @@ MAX_DOCUMENT_BYTES = 100_000_000
 MAX_PDF_OBJECTS = 20_000
 MAX_PDF_VALUES = 1_000_000
 # Maximum number of references to missing PDF objects: pypdf searches the whole file for each
-MAX_MISSING_OBJECTS = 100
+MAX_UNRESOLVED_REFERENCES = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
@@ -162,10 +162,10 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Measure the cost of inflating the zlib data at ``start``, up to ``limit`` + 1.
+    """Return the size (bytes) of the zlib data at ``start``, up to ``limit`` + 1; 0 without zlib.
 
-    The cost is the compressed or the inflated size (bytes), whichever is larger, or at least 1000.
-    It is 0 if there are no zlib data.
+    The size is the maximum of compressed, inflated and 1000 bytes, so that limits of the sizes
+    also limit the time.
     """
     header = pdf[start : start + 2]
     if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
@@ -183,50 +183,50 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
         except zlib.error:  # pypdf rejects this stream, because repair is disabled
             break
     input_bytes -= len(inflate.unused_data)
-    # starting to inflate costs as much as 1000 bytes
+    # the start of inflating takes the time of 1000 bytes
     return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
 def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
     """Yield all PDF dictionaries that a viewer can reach, each once, without decoding streams.
 
-    The flag is True if a viewer reaches the dictionary only by a click on a link or bookmark.
+    The flag is True if the dictionary is reached only by a click on a link or bookmark.
     """
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining_values:
-        value, needs_click = remaining_values.pop()
+        value, is_reached_by_click = remaining_values.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, needs_click) in visited:
+            if (value, is_reached_by_click) in visited:
                 continue
-            visited.add((value, needs_click))
+            visited.add((value, is_reached_by_click))
             # pypdf searches the whole file for objects that the cross-reference table does not list
             number, generation = value.idnum, value.generation
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
             missing_count += not is_listed
-            if len(visited) > MAX_PDF_OBJECTS or missing_count > MAX_MISSING_OBJECTS:
+            if len(visited) > MAX_PDF_OBJECTS or missing_count > MAX_UNRESOLVED_REFERENCES:
                 raise ResultsError(_COSTLY_REASON)
             # ISO 32000-1, 7.3.10: a reference to a missing object is null
             value = value.get_object() if is_listed else None
         if value_count > MAX_PDF_VALUES:
             raise ResultsError(_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
-            yield value, needs_click
+            yield value, is_reached_by_click
             remaining_values.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
-def _foreign_features(dictionary: DictionaryObject, needs_click: bool) -> Iterator[str]:
+def _foreign_features(dictionary: DictionaryObject, is_reached_by_click: bool) -> Iterator[str]:
     """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
     yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
     action, dictionary_type = (_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
-    if action == "/URI" and not needs_click:
+    if action == "/URI" and not is_reached_by_click:
         yield "an action that opens an address"
     is_stream = isinstance(dictionary, StreamObject)
     if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
@@ -261,8 +261,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
-    for dictionary, needs_click in _all_dictionaries(reader):
-        features.update(_foreign_features(dictionary, needs_click))
+    for dictionary, is_reached_by_click in _all_dictionaries(reader):
+        features.update(_foreign_features(dictionary, is_reached_by_click))
         embedded_files: list[object] = (
             [dictionary] if _pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
         )

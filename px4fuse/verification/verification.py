@@ -35,12 +35,14 @@ from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verification
 from px4fuse.verification.pages import TextComparison, compare_pages
 
-ASK_ADVICE = "Ask the author how the report was made, and for its log and all other input files."
+ASK_AUTHOR_REMEDY = (
+    "Ask the author how the report was made, and for its log and all other input files."
+)
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
 # Minimum KF prediction step DT (s) of a report: for ten minutes of flight, 60,000 steps take half a
 # minute
 MIN_DT_S = 0.01
-ORIGINAL_PDF_ADVICE = "Ask the author of the report for the PDF that px4fuse wrote."
+ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
 LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
@@ -56,7 +58,7 @@ ABSOLUTE_TOLERANCE = 1e-9
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
 # Absolute tolerance of recorded estimates near zero
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
-# Beginnings of the paths of estimates in the results
+# Starts of the paths of estimated quantities in the results
 ESTIMATE_PATHS = (
     "tuning",
     "clock",
@@ -80,9 +82,9 @@ MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
-# Factors between a result and its printed number: 1, per cent, thousandths (mm, ms)
+# Factors from a result to its printed number: none, to per cent, to thousandths (mm, ms)
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
-# Maximum number of lines of a student's notes in a report that px4fuse draws again: a page has 60
+# Maximum number of lines of a student's notes in a report; a page has 60 lines
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
@@ -92,7 +94,7 @@ _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Analysis of a report that cannot be repeated; arguments: reason, remedy, missing file."""
+    """Error of an analysis that cannot be repeated; arguments: reason, remedy, missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -113,7 +115,9 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
-            raise NotRepeatableError("the results do not list the library versions", ASK_ADVICE)
+            raise NotRepeatableError(
+                "the results do not list the library versions", ASK_AUTHOR_REMEDY
+            )
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             link_file = partial(_link_file, logs, Path(folder))
             if isinstance(results, LoopResults):
@@ -122,31 +126,31 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
                 analysis, new_results = _repeat_comparison(results, link_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
     except SettingsError as error:  # px4fuse rejects these settings, so no report can contain them
-        return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_ADVICE)
+        return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
     except NotRepeatableError as error:
         return cannot_verify(*error.args)
     except Px4FuseError as error:
-        return cannot_verify(str(error), ASK_ADVICE)
+        return cannot_verify(str(error), ASK_AUTHOR_REMEDY)
     except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
         reason = f"the analysis cannot be repeated ({type(error).__name__})"
-        return cannot_verify(reason, ASK_ADVICE)
+        return cannot_verify(reason, ASK_AUTHOR_REMEDY)
 
 
 def _link_file(
-    logs: Mapping[str, Path], folder: Path, name: str, sha256: str | None, role: str
+    logs: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
-    The link has the recorded name, because the report prints it. ``role`` names the file in errors.
+    The link has the recorded name, because the report prints it. ``file_label`` is for errors.
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
         missing_name = one_line(name, 80) or "the file"
-        reason = f"none of the given files has the SHA-256 of {role}"
+        reason = f"none of the given files has the SHA-256 of {file_label}"
         raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
-        raise NotRepeatableError(reason, ASK_ADVICE)
+        raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # each link has a separate folder, because two files may have the same name
     target = Path(tempfile.mkdtemp(dir=folder), name)
     try:
@@ -173,7 +177,7 @@ def _repeat_comparison(
     recorded_request = submitted_results.request
     if recorded_request.dt_s < MIN_DT_S:
         reason = f"DT is below {MIN_DT_S:g} s, so the analysis would take too long"
-        raise NotRepeatableError(reason, ASK_ADVICE)
+        raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(
         recorded_request,
@@ -256,11 +260,11 @@ def verify(
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
-        return cannot_verify(reason, ASK_ADVICE)
-    new_results = recompute(results, logs)
-    if isinstance(new_results, Verification):
-        return new_results
-    return _verify_with_log(results, pdf, *new_results)
+        return cannot_verify(reason, ASK_AUTHOR_REMEDY)
+    recomputed = recompute(results, logs)
+    if isinstance(recomputed, Verification):
+        return recomputed
+    return _verify_with_log(results, pdf, *recomputed)
 
 
 def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
@@ -279,7 +283,7 @@ def _verify_with_log(
     if redrawn_pdf == pdf:
         reason = "a new run on the log gives an identical PDF"
         return Verification(
-            "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
+            "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn_pdf=redrawn_pdf
         )
     mismatches, is_same_number, value_count = compare_results(
         to_json_dict(submitted_results), to_json_dict(new_results)
@@ -303,7 +307,7 @@ def _verify_with_log(
         if page_differences
         else ()
     )
-    # pages of another program, or drawn with other library versions, may differ anyway
+    # pages from another program or from other library versions may differ without a forgery
     is_comparable = not (is_from_other_program or other_versions)
     page_status: PageStatus = "same"
     if page_differences:
@@ -320,7 +324,7 @@ def _verify_with_log(
         reasons = page_sentences + reasons
     else:
         reasons += page_sentences
-    remedy = ORIGINAL_PDF_ADVICE if is_from_other_program else ""
+    remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
     if other_versions:  # other library versions may draw other pages
         versions_text = one_line(", ".join(map(" ".join, sorted(other_versions))), 300)
         reasons.append(
@@ -340,13 +344,16 @@ def _verify_with_log(
     )
 
 
-def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
-    """Return True if two printed numbers differ only because equal results were rounded.
+def is_same_number_rounded(
+    pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
+) -> bool:
+    """Return True if two printed numbers are roundings of results that agree.
 
     ``pairs`` are recorded and recomputed results that are equal within the tolerances.
     """
-    decimals, printed_pair = _decimal_count(number), (float(number), float(redrawn))
-    return decimals == _decimal_count(redrawn) and any(
+    decimals = _decimal_count(submitted_number)
+    printed_pair = float(submitted_number), float(redrawn_number)
+    return decimals == _decimal_count(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
         for a, b in pairs
@@ -422,10 +429,10 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _is_near(path: str, submitted_number: float, new_number: float, is_estimate: bool) -> bool:
+def _is_near(path: str, submitted_number: float, new_number: float, is_estimated: bool) -> bool:
     if isinstance(new_number, int):
         tolerance: float = MAX_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
-    elif is_estimate:
+    elif is_estimated:
         tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:
         tolerance = RELATIVE_TOLERANCE * abs(new_number) + ABSOLUTE_TOLERANCE
@@ -449,11 +456,10 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     if first_text == second_text:
         return True
     # the split lists contain texts and numbers in turn
-    text_parts = _NUMBER_PATTERN.split(first_text)
-    other_text_parts = _NUMBER_PATTERN.split(second_text)
-    numbers = zip(text_parts[1::2], other_text_parts[1::2], strict=False)
-    return text_parts[::2] == other_text_parts[::2] and all(
-        a == b or is_same_number(a, b) for a, b in numbers
+    first_parts, second_parts = map(_NUMBER_PATTERN.split, (first_text, second_text))
+    number_pairs = zip(first_parts[1::2], second_parts[1::2], strict=False)
+    return first_parts[::2] == second_parts[::2] and all(
+        a == b or is_same_number(a, b) for a, b in number_pairs
     )
 
 

@@ -179,7 +179,9 @@ def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
         draw_questions(answers.log_sha256), answers.quantities, truth.quantities
     ):
         if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
-            rows.append((f"{question.text}, within {FULL_POINTS_TOLERANCE:.0%}", given, right))
+            rows.append(
+                (f"{question.text}, within {100.0 * FULL_POINTS_TOLERANCE:g} %", given, right)
+            )
     for letter, (choice, right_letter) in zip_longest(
         answers.choices[: len(truth.choices)], truth.choices
     ):

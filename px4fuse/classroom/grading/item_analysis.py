@@ -47,7 +47,7 @@ class ItemStatistics:
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     """Compute statistics of rubric items, parts of the answer form, and faults, in this order.
 
-    Reports that need a decision of the instructor do not count.
+    Reports that need a decision of the instructor, and items that await points, do not count.
     """
     rows_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
@@ -59,6 +59,8 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
         ):
             total = sum(item.points for item in items)
             for item in items:
+                if item.awaits_points:
+                    continue
                 item_row = item.points, item.max_points, total - item.points
                 rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
         for kind, is_named in report.mistakes.items():

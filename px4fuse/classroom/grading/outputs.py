@@ -123,8 +123,8 @@ def write_class(
     feedback_texts = [feedback_text(entry, class_title) for entry in entries]
     reports = [report for entry in entries if (report := entry.counted_report)]
     item_rows = tuple(
-        tuple(map(neutralise_formulas, item_statistics.csv_row))
-        for item_statistics in analyse_items(reports)
+        (neutralise_formulas(title), *numbers)
+        for title, *numbers in (statistics.csv_row for statistics in analyse_items(reports))
     )
     contents = {
         "class.csv": class_table_csv(entries).encode(),

@@ -81,10 +81,10 @@ def load_or_verify(
     # the verdict is "cannot verify" instead of "other log" if an assigned log is not available
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verdict = verify(results, pdf, {} if is_log_missing else logs)
-    files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
+    files = {REDRAWN_SUFFIX: verdict.redrawn_pdf} if verdict.redrawn_pdf else {}
     if verdict.status == "verified" and log_sha256(results) in assigned_hashes:
         results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, logs)
-    stored_verdict = replace(verdict, redrawn=b"")
+    stored_verdict = replace(verdict, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verdict)
     _write_record(records, sha256, record, files)
     return results, stored_verdict, False
