@@ -61,6 +61,9 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
+# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
+# offsets only fits noise
+MIN_SLOW_RATIO = 0.25
 # Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
 MAX_REMAINING_FRACTION = 0.2
 # Minimum fraction of the mean square slow error that a sinusoid explains
@@ -363,7 +366,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.slow_square_m2 <= 0.0
+        or fit.slow_square_m2 < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
         or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
     ):
         return None
