@@ -27,28 +27,28 @@ NEIGHBOURS = np.array([-2, -1, 1, 2])
 # Maximum time (median intervals) from the first to the last neighbour: lost positions and gaps
 # make the cubic inaccurate
 MAX_NEIGHBOUR_SPAN = 8.0
-# Maximum factor between the noise of a residual and that of a position
+# Maximum noise of a residual ÷ noise of a position
 MAX_RESIDUAL_FACTOR = 4.0
-# Number of timestamps in the running median that jitter does not shift, but a lost position does
+# Number of timestamps in a running median: jitter does not shift this median, a lost position does
 MEDIAN_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Number of successive residuals that share neighbours, so that only one of them is independent
+# Only one of this number of successive residuals is independent, because they share neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
-# Minimum and maximum ratio of the residuals to jitter · velocity, if jitter causes them
+# Minimum and maximum of residual ÷ (jitter · velocity), if jitter causes the residuals
 JITTER_RATIOS = 0.6, 1.5
-# Minimum ratio of the errors by jitter to all white errors
+# Minimum fraction of the white errors that jitter causes
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
-# Number of flight parts in which the growth with speed is tested, and its minimum median
-# significance (σ)
+# Growth of the noise with speed: number of tested flight parts, and minimum median of their
+# significances (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
-# Fractions of the positions that are slow and fast
+# Quantiles of the speed: below the first a position is slow, above the second it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
-# Minimum ratio of the noises at high and low speed, along and across the motion
+# Minimum noise at high speed ÷ noise at low speed, along and across the motion
 MIN_SPEED_NOISE_RATIO = 1.6
 # Minimum extent (m, RMS) of the motion for a fit to ground truth
 MIN_PATH_RMS_M = 0.5
@@ -60,8 +60,8 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
-# offsets only fits noise
+# Minimum mean square of slow errors ÷ that of white noise: with less, the time offsets of the
+# flight parts only fit noise
 MIN_SLOW_RATIO = 0.25
 # Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
 MAX_REMAINING_FRACTION = 0.2
@@ -73,7 +73,7 @@ MIN_AMPLITUDE_SIGMAS = 1.0
 MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz)
 MAX_FREQUENCY_HZ = 2.0
-# Maximum ratio of the sinusoid in the motion to the RMS extent of the motion
+# Maximum fraction of the mean square motion at the frequency of a periodic error
 MAX_MOTION_FRACTION = 0.1
 # Interval (s) and limit (s) of the tested delays of the logged attitude
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
@@ -85,7 +85,7 @@ MAX_ROTATIONS = 20_000
 ROTATION_STEP_S = 0.1
 # Maximum difference (rad) of rotations: larger differences are resets of the attitude
 MAX_ROTATION_RAD = 0.2
-# Maximum ratio of the mean square rotation differences with and without the delay
+# Maximum mean square rotation difference with ÷ without correction of the delay
 MAX_DELAYED_RATIO = 0.5
 # Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
@@ -181,18 +181,19 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     for row in range(len(NEIGHBOURS)):
         for other in set(range(len(NEIGHBOURS))) - {row}:
             weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
-    factor = np.sqrt(1.0 + np.sum(weights**2, axis=1))
-    phase_s = time_s - interval_s * np.arange(len(time_s))
-    late_s = phase_s - median_filter(phase_s, MEDIAN_COUNT, mode="nearest")
-    half = max(2, round(HALF_VELOCITY_S / interval_s))
-    first, last = np.clip(rows - half, 0, None), np.clip(rows + half, None, len(time_s) - 1)
+    noise_factor = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    deviation_s = time_s - interval_s * np.arange(len(time_s))
+    late_s = deviation_s - median_filter(deviation_s, MEDIAN_COUNT, mode="nearest")
+    half_count = max(2, round(HALF_VELOCITY_S / interval_s))
+    first = np.clip(rows - half_count, 0, None)
+    last = np.clip(rows + half_count, None, len(time_s) - 1)
     velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
-    is_accurate = factor < MAX_RESIDUAL_FACTOR
+    is_accurate = noise_factor < MAX_RESIDUAL_FACTOR
 
     def residual(values: Array) -> Array:
         interpolated = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled = ((values[rows] - interpolated).T / factor).T
-        return np.asarray(scaled[is_accurate])
+        residuals = ((values[rows] - interpolated).T / noise_factor).T
+        return np.asarray(residuals[is_accurate])
 
     return WhiteErrors(residual(position_m), velocity_m_s[is_accurate], residual(late_s))
 
@@ -209,8 +210,8 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     if jitter_s < MIN_JITTER_S or not expected_square_m2:
         return None
     ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
-    rest_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(rest_m**2) / expected_square_m2)
+    other_errors_m = errors.residual_m - ratio * expected_m
+    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(other_errors_m**2) / expected_square_m2)
     fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIOS[0] < ratio < JITTER_RATIOS[1]
@@ -290,10 +291,10 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     )
     error_m = position_m - curve(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
-    # successive errors are correlated
+    # successive errors are correlated, so fewer of them are independent
     interval_s = float(np.median(np.diff(time_s)))
-    independent = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
-    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent))
+    independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
+    scale_sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
     if comparison.source.origin.may_drift:
         width = max(1, round(DRIFT_WINDOW_S / interval_s))
 
@@ -310,7 +311,7 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
         remaining_m,
         white_m,
         float(parameters[2]),
-        float(sigma),
+        float(scale_sigma),
     )
 
 
@@ -354,13 +355,13 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the constants of :class:`ErrorFit` are fitted together.
     At rest a time offset causes no error, so jumps and slow errors are not explained.
     """
-    parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-    square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
-    square_speeds = square_sums / np.maximum(np.bincount(parts), 1)
+    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
+    square_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
+    square_speeds = square_sums / np.maximum(np.bincount(part_indices), 1)
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None
-    is_in_part = parts[:, None] == moving_parts
+    is_in_part = part_indices[:, None] == moving_parts
     offset_columns = -fit.velocity_m_s[:, :, None] * is_in_part[:, None, :]
     constant_columns = fit.columns[..., :-1]  # without the constant time offset
     parameters, remaining_m = _least_squares(
@@ -376,9 +377,9 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
-    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
+    extremes = np.argmin(offsets_s), np.argmax(offsets_s)
     return OffsetVariation(
-        float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
+        *(float(values_s[index]) for values_s in (offsets_s, times_s) for index in extremes)
     )
 
 
@@ -393,21 +394,21 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         return None
     quaternions = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
     rotation_rad = to_vector(multiply(conjugate(quaternions[:-step]), quaternions[step:]))
-    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_s)
+    gyro_angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_s)
 
-    def difference(delay_s: float) -> float:
-        angles = [np.interp(time_s - delay_s, imu_s, column) for column in angle_rad.T]
-        differences_rad = (
-            rotation_rad - (np.array(angles)[:, step:] - np.array(angles)[:, :-step]).T
+    def mean_square_difference(delay_s: float) -> float:
+        angles_rad = np.array(
+            [np.interp(time_s - delay_s, imu_s, column) for column in gyro_angle_rad.T]
         )
+        differences_rad = rotation_rad - (angles_rad[:, step:] - angles_rad[:, :-step]).T
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
         # resets of the attitude are larger than the rotations of a multicopter
         sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
         return float(np.mean(sizes_rad**2))
 
     delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * DELAY_STEP_S)
-    delay_s = float(min(delays_s, key=difference))
-    is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and difference(
+    delay_s = float(min(delays_s, key=mean_square_difference))
+    is_delay_confirmed = mean_square_difference(
         delay_s
-    ) < MAX_DELAYED_RATIO * difference(0.0)
-    return delay_s if is_late else None
+    ) < MAX_DELAYED_RATIO * mean_square_difference(0.0)
+    return delay_s if is_delay_confirmed and abs(delay_s) >= MIN_ATTITUDE_DELAY_S else None
