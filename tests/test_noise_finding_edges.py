@@ -260,7 +260,7 @@ def test_inconsistent_filter_report_combines_north_and_east() -> None:
     assert found[1].title == "KF is overconfident along east: σ is 1.73 times too small"
     main = analysis(axes=(kf(2.0), kf(3.0, "east")))
     assert only(noises.detect_inconsistent_variances, main).evidence["axis"] == "north"
-    assert "The mean NIS is 3, expected 0.80 to 1.20 (horizontal axes)" in found[1].message
+    assert "The mean NIS of this horizontal axis is 3, expected 0.80 to 1.20" in found[1].message
     assert group_by_cause(found) == found
 
 
@@ -498,7 +498,7 @@ def test_possible_drift_report_states_loop_closure_error() -> None:
     ):  # fmt: skip
         one = analysis(source=ODOMETRY, tuning=tuned(noise), loop=closing(1.25))
         finding = only(hidden_errors.detect, one)
-        assert f"position noise without drift is {bound}{value} m" in finding.message
+        assert f"position noise (1 σ) is {bound}{value} m, without the drift" in finding.message
         assert finding.evidence["short_term_noise_m"] == value
         assert "closure error is 1.25 m after a path of 50 m." in finding.message
     assert named(hidden_errors.detect, analysis(source=MOVING)) == {}
