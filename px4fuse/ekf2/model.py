@@ -56,12 +56,12 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
-    FIELD_NOISE_PARAMETERS,
     FLOW,
     GNSS_HGT,
     GNSS_POS,
     GNSS_VEL,
     MAG,
+    MAGNETIC_FIELD_NOISE_PARAMETERS,
     PARAMETERS,
     check_parameters,
 )
@@ -209,7 +209,7 @@ def replay_settings(
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
-                MAG.measurement_parameters.union(FIELD_NOISE_PARAMETERS),
+                MAG.measurement_parameters.union(MAGNETIC_FIELD_NOISE_PARAMETERS),
                 "the log lacks some fused magnetometer samples",
             ),
             (
