@@ -228,7 +228,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert ". The published height differs by at most " in found.notes[-1]
+    assert ". The heights of the two replays differ by at most " in found.notes[-1]
 
 
 def test_what_if_with_long_height_rejection_is_unpredictable() -> None:

@@ -70,7 +70,7 @@ Vector = tuple[float, float, float]
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
-# The decorator tells type checkers that subclasses are frozen, too
+# Subclasses inherit frozen=True; type checkers need the decorator to know this
 @dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Immutable record; fields that are None are not written to the results.
