@@ -179,9 +179,9 @@ class ClockMap(Record):
     method: str
     # Number of simultaneous readings of both clocks
     pairs: Count
-    # Boot clock minus this clock, at the middle of the readings
+    # Boot clock minus converted clock, at the middle of the readings
     offset_s: float
-    # Rate of the boot clock minus rate of this clock
+    # Rate of the boot clock minus rate of the converted clock
     drift_ppm: float
     # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
     jitter_s: NotNegative
@@ -421,7 +421,7 @@ class PositionTrack:
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
     # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None
-    # for a constant orientation: such a source is not odometry
+    # if the orientation is constant, because the source is then not odometry
     orientation: pd.DataFrame | None = None
     # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None

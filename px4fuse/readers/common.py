@@ -56,7 +56,7 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
+    """Return a note on a file that ends within a ``unit`` ("frame" or "message")."""
     return (
         f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"

@@ -205,12 +205,10 @@ def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers
-    absolute_numbers = np.abs(numbers)
-    is_too_small = (
-        (row == column) & (absolute_numbers > 0.0) & (absolute_numbers < _MIN_INFORMATION)
-    )
+    magnitudes = np.abs(numbers)
+    is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)
     edges.raise_where(
-        is_too_small | (absolute_numbers > _MAX_INFORMATION),
+        is_too_small | (magnitudes > _MAX_INFORMATION),
         "the information matrix contains a number that is too small or too large",
         f"Give 0, or a number from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )

@@ -47,7 +47,7 @@ VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 REAL32_PARAMETER_TYPE = 9
 
 
-# No warnings for damaged values: they become NaN or infinite, and such samples are dropped
+# No warnings for damaged values: they become NaN or infinite, and their samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
@@ -228,17 +228,15 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
 def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
-    system_states = recording.frames.table("EXTENDED_SYS_STATE", rows)
-    is_known = system_states["landed_state"] > 0
+    landed_states = recording.frames.table("EXTENDED_SYS_STATE", rows)["landed_state"]
+    is_known = landed_states > 0
     if not np.any(is_known):
         return Unavailable(
             "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
-    landed = pd.Series(
-        system_states["landed_state"][is_known] == messages.ON_GROUND_STATE, index=time_s
-    )
+    landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
     return common.flight_spans(landed, recording.duration_s)
 
 

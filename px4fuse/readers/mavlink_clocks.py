@@ -26,8 +26,7 @@ MIN_UNIX_TIME_S = 1e9
 # Length (s) of an interval. The clock fit uses the message with the least delay of each interval
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
-# Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
-# the same rate
+# Minimum time span (s) to estimate a clock drift: in a shorter span the drift is assumed to be 0
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two real clocks. A replayed recording has a
 # larger difference, which is estimated even below MIN_DRIFT_SPAN_S

@@ -197,7 +197,7 @@ def read_truth(
 
     1. Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
        PX4), so receive times are used.
-    2. Its latitude and longitude are projected from the autopilot's origin if the source is GNSS;
+    2. True latitude and longitude are projected from the autopilot's origin if the source is GNSS,
        otherwise from the first sample, the start of the simulated vehicle.
     """
     for layout in messages.TRUTH_LAYOUTS:

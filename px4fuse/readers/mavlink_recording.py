@@ -42,7 +42,7 @@ MIN_GROUP_FRACTION = 0.01
 MAX_OUTSIDE_S = 60.0
 # Maximum fraction of bytes outside of MAVLink frames in a file without damage
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of equal boot timestamps that show that the field is not a clock
+# Minimum number of boot timestamps to reject them as no clock if almost all are equal
 MIN_CONSTANT_TIMESTAMPS = 10
 
 

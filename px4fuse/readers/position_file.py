@@ -299,7 +299,7 @@ def _read_numbers(
     quaternion_columns: list[int],
     body: str | None,
 ) -> tuple[pd.DataFrame, bool]:
-    """Read columns as numbers; also return False if ISO 8601 times lack the time zone.
+    """Return columns as numbers, and False if ISO 8601 times lack the time zone (else True).
 
     The unit of columns with ISO 8601 times becomes "s" in ``meanings``.
     """
@@ -337,7 +337,7 @@ def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Serie
 
 
 def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
-    """Convert ISO 8601 times to seconds since 1970; also return False if they lack the zone."""
+    """Convert ISO 8601 times to UNIX time (s); also return True if they have a time zone."""
     texts = texts.str.replace(",", ".", regex=False)
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
     unix_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
@@ -347,7 +347,7 @@ def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
 def _select_body(
     table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body: str | None
 ) -> pd.DataFrame:
-    """Return the rows of one tag, if a column contains the tags of several bodies."""
+    """Return the rows of the chosen body, if a column contains tags of several bodies."""
     for index, meaning in enumerate(meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()

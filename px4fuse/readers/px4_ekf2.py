@@ -42,13 +42,12 @@ VALIDITY_FLAGS = ("xy_valid", "xy_global")
 STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
 MAG_3D_BIT = 5
-# Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
+# Minimum logged rate (Hz) of a magnetometer topic with all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
 # EKF2 may round the ratio of prediction interval to IMU interval up or down if its distance from
 # n + 0.5 is smaller
 MAX_HALF_RATIO_DISTANCE = 0.05
-# Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
-# between them
+# Maximum interval (s) between two logged rows of optical flow to undo EKF2's low-pass filter
 MAX_FLOW_INTERVAL_S = 0.5
 # Aiding sources of horizontal position and velocity other than external vision position
 OTHER_HORIZONTAL_AIDS = (

@@ -10,7 +10,7 @@ from px4fuse.readers.common import interpolate_inside
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
+# Maximum time difference (s) between a logged fix and EKF2's observation of it: receivers
 # send a fix every 0.05 s or less often
 MAX_SAME_FIX_S = 0.01
 # Maximum difference (°) of EKF2's observation from the logged latitude: above it (100 km), the

@@ -320,10 +320,9 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
         decimal_fields = [field.replace(",", ".") for field in fields]
         if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimal_fields[1:])):
             continue
-        has_time = is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0])
         if separator == " " and len(fields) == 12:
             return _kitti_table(path, text)
-        if has_time:
+        if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
             name, quaternion_order = NO_HEADER, ""
             if separator in " \t" and len(fields) == 8:
                 name, quaternion_order = "TUM trajectory", "xyzw"

@@ -86,11 +86,8 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     if np.isnan(position_m).any():
         raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
     rotation = _read_rotation(recording)
-    is_text = not is_bag(path)
-    first_text = (
-        read_head(path, _HEAD_BYTES, TrajectoryError).decode(errors="replace") if is_text else ""
-    )
-    comments = "\n".join(re.findall(r"(?m)^\s*#.*", first_text))
+    first_bytes = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    comments = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
     kind, kind_note = _detect_kind(path, comments, position_m, rotation)
     frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
