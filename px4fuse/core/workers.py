@@ -203,7 +203,7 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         phase = "a job" if worker.is_ready else "its start"
         exit_code = worker.process.exitcode
         return False, JobFailure(
-            f"the worker process ended during {phase} (exit code {exit_code}). Repeat the command."
+            f"the worker process ended during {phase} (exit code {exit_code})."
         )
     # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
