@@ -51,7 +51,7 @@ class CorrelationPeak:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(CorrelationPeak):
-    """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag), near a peak.
+    """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag).
 
     Attributes
     ----------

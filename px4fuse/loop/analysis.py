@@ -170,7 +170,7 @@ def _find_true_end(
     if not request.closed_loop:
         return Unavailable(
             "loop closure error",
-            "with --open, the path does not return to its start",
+            "the path does not return to its start, as stated with --open",
             "Omit --open.",
         )
     if isinstance(truth_end, TrueEnd):
@@ -240,7 +240,9 @@ def _compute_heading_error(
     if isinstance(true_end, Unavailable):
         return true_end
     if heading_change_deg is None:
-        return Unavailable(quantity, "the trajectory has no orientations", "No action is needed.")
+        return Unavailable(
+            quantity, "the trajectory has no orientations", "Use a trajectory with orientations."
+        )
     if true_end.heading_change_deg is None:
         return Unavailable(
             quantity,

@@ -376,7 +376,7 @@ def score_paths(
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
             return Unavailable(
-                f"score against {reference.name}",
+                f"ATE and RPE against {reference.name}",
                 str(error),
                 "Give another reference trajectory with --reference.",
             )

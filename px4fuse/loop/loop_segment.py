@@ -168,7 +168,7 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
 def read_end_from_truth(
     path: Trajectory, truth: Trajectory, segment: Segment, rests_at_ends: bool
 ) -> TrueEnd | str:
-    """Return the true landing place in the odometry frame, or the reason why it is unknown."""
+    """Return the true final pose in the odometry frame, or the reason why it is unknown."""
     try:
         true_path = cut_trajectory(truth, segment, rests_at_ends)
     except TrajectoryError as error:

@@ -95,7 +95,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
             f"{flight.log.name}:{track_name}: {track_data.reason}", track_data.remedy
         )
     state = track_data.state
-    notes = ["EKF2 position as published"]
+    notes = ["EKF2 position as published by PX4"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         segment = Segment(0.0, flight.log.duration_s, "")

@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight, with the answers for the instructor."""
+"""Simulated flights as PX4 topics, ULog or Flight; injected faults and true values as answers."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -32,7 +32,8 @@ MIN_LATENCY_S = 0.005
 POSITION_INTERVAL_JITTER = 0.02
 # Time (s) from the first data to the first position
 FIRST_POSITION_S = 0.1
-# Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
+# Time (s) until PX4 uses the sender's timestamps instead of arrival times: 500 TIMESYNC replies at
+# 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
 # Mean number of positions in a burst of outliers
 MEAN_OUTLIER_BURST_LENGTH = 3

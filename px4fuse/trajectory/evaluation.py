@@ -527,8 +527,8 @@ def _move_to_reference_body(
     return corrected_estimate, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
         "estimate has other body axes than the reference, for example those of a camera. The "
-        f"position of the estimate is {lever_arm_text} of the reference body. The errors are "
-        "computed after a correction of rotation and position.",
+        f"origin of the estimate is displaced by {lever_arm_text} of the reference body. Both "
+        "differences are removed before the errors are computed.",
     )
 
 
