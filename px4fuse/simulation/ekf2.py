@@ -169,9 +169,9 @@ def simulate_ekf2(
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
-        step_s=step_s,
+        mean_step_s=step_s,
         horizon_s=(buffer_length - 1) * step_s,
-        predict_s=PREDICTION_STEP_US * 1e-6,
+        configured_step_s=PREDICTION_STEP_US * 1e-6,
         vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
@@ -309,7 +309,7 @@ def _compute_output(
     inputs: Inputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
 ) -> Ekf2Output:
     segment = model_run.segment
-    lag_steps = round(inputs.horizon_s / inputs.step_s)
+    lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state, _ = delayed_states(model_run, 0)
     resets, is_step_aided = _hold_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
@@ -324,7 +324,7 @@ def _compute_output(
         [np.zeros((1, 3)), np.cumsum(attitude_error_steps_rad, axis=0)]
     )
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
-        state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.step_s, inputs.horizon_s
+        state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
     velocity_m_s, position_m = publish(
         segment, state, reset_sum_m, attitude_error_rad, lag_steps, inputs.settings

@@ -242,11 +242,11 @@ def _magnetometer_topics(
     end_step = model_run.events[0].end_step
     if field is None:
         return []
-    has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
+    has_sample = np.isfinite(model_run.magnetometer_updates[:, 2, 0, 0])
     logged_indices = output.logged_message_indices(has_sample, end_step, OTHER_AIDS_HZ)
     logged_steps = end_step[logged_indices]
     innovation, innovation_variance, fused_fraction = np.moveaxis(
-        model_run.field[logged_indices, :, 0], 1, 0
+        model_run.magnetometer_updates[logged_indices, :, 0], 1, 0
     )
     observed_gauss = field.value[np.searchsorted(field.step, logged_steps, side="right") - 1]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
