@@ -183,7 +183,7 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 
 
 def _smooth(grid_values: Array, time_s: Array, step_s: float, order: int = 0) -> Array:
-    """Smooth values on a time grid, or return their derivative (order 1) by grid steps."""
+    """Smooth values on a time grid; with order 1, return their derivative per grid step."""
     sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
     return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=order))
 
@@ -278,7 +278,7 @@ class _OffsetFit:
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
-    """Compute the half-width (s) of the 95 % interval.
+    """Compute the half-width (s) of the 95 % interval of the time offset.
 
     The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
     same effect as a time offset.

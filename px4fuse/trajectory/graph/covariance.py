@@ -136,7 +136,7 @@ def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
     is_backward = graph.first[odometry_edges] > graph.second[odometry_edges]
-    # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
+    # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
     covariance[is_backward] = (
         measured_adjoint @ covariance[is_backward] @ measured_adjoint.transpose(0, 2, 1)

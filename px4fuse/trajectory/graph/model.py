@@ -103,7 +103,7 @@ class PoseGraph:
     dimension: int
     # Vertex numbers of the file, in ascending order
     ids: IntArray
-    # x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
+    # Poses: x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
     poses: Array
     # Indices into ``poses`` of the two vertices of each edge
     first: IntArray
