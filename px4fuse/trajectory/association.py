@@ -131,7 +131,7 @@ def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
 
 
 def is_bracketed(time_s: Array, reference_s: Array, gap_limit_s: float) -> BoolArray:
-    """Return a mask of times between two reference times that are at most ``gap_limit_s`` apart.
+    """Return a mask of times between two reference times with a gap of at most ``gap_limit_s``.
 
     Times that equal a reference time are included.
     """

@@ -245,7 +245,7 @@ def _descend_graduated(
     if np.max(chi2_excess) > 0.0:
         gnc_control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
-            # the limit avoids a division by zero; the weight of such a small residual is 1
+            # the limit avoids a division by zero and does not change the weight, which is 1
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
                 np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
