@@ -41,7 +41,7 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS
 
-# Maximum time span (s) of file and log for _explain_mismatch, which takes 1 s per hour
+# Maximum time span (s) of file and log in which a mismatch is explained: takes 1 s per hour of data
 MAX_EXPLAINED_SPAN_S = 7200.0
 
 
