@@ -40,7 +40,7 @@ def run_kf(
 
 
 def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Add the results along each axis: KF against EKF2, and both against ground truth."""
+    """Compare KF with EKF2, and both with ground truth, along each axis that KF ran along."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -318,7 +318,7 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # the horizontal NIS needs the innovations north and east of an update (same timestamp)
+    # keep updates with innovations along both axes (same timestamp)
     north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])

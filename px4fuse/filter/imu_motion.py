@@ -311,7 +311,7 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # the initial position is unknown, and small numbers limit rounding errors
+    # subtract the first position, which is unknown anyway: small numbers limit rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_m = measured_m.groupby(segment_index).transform("first")
