@@ -486,7 +486,7 @@ def _maximise_by_gradient(
         # divide by the number of measurements, so that the gradient and the first step are about 1
         try:
             return likelihood(to_noises(logs)) / measurement_count
-        # far from the maximum rounding errors dominate: a large value makes L-BFGS-B shorten its step
+        # where rounding errors dominate, a large value makes L-BFGS-B shorten its step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 
