@@ -83,7 +83,7 @@ def test_long_flight_fit_equals_fit_of_all_measurements(
 
 
 def test_tune_of_fast_source_finds_outliers_in_skipped_rows() -> None:
-    """Of 100 Hz, only every fourth position is used for the noises."""
+    """Only every fourth position is used for the noises at 100 Hz."""
     axis = modelled(4, 2000)
     fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
     measured_m = 0.1 * np.random.default_rng(4).standard_normal(2001)

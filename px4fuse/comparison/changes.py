@@ -252,7 +252,7 @@ def _vibration_noise_changes(
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
     in each DT.
     """
-    steps_per_dt = settings.dt_s / ekf2_inputs.step_s
+    steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
     logged_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0

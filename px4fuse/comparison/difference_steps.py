@@ -236,7 +236,7 @@ def _step_reasons(
     ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
     samples_text = (
         f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
-        f"every {1e3 * ekf2_inputs.step_s:.0f} ms"
+        f"every {1e3 * ekf2_inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
         samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
@@ -257,7 +257,7 @@ def _step_reasons(
             f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
-        ekf2_inputs.step_s / kf_settings.dt_s
+        ekf2_inputs.mean_step_s / kf_settings.dt_s
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {

@@ -16,6 +16,7 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
+    ALIGNED,
     HEIGHT_ONLY_REASON,
     POSITION_FILE,
     Columns,
@@ -38,7 +39,9 @@ from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
-LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {source.name: source.origin for source in POSITION_INPUTS}
+LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
+    source.track_name: source.origin for source in POSITION_INPUTS
+}
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -74,7 +77,7 @@ def prepare(
             source_track, origin=structs.replace(source_track.origin, kind=source_kind)
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
-    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == "aligned by EKF2"
+    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
     is_withheld = as_sent or is_in_ned or flight.log.is_assessed
     convention = None if is_withheld else check_convention(flight, source_track)
     if convention is not None and settings.clock_offset_s:  # the user chose the time offset
