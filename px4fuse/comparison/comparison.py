@@ -100,7 +100,7 @@ def _compare_axis(
             ),
             "ekf2": _summarise_filter(innovations, ekf2_variance, ekf2_errors, gate),
         },
-        difference=difference(kf_run, ekf2_state),
+        difference=difference_statistics(kf_run, ekf2_state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         replay=kf_run,
@@ -153,7 +153,7 @@ def _known_values(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def difference(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
+def difference_statistics(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
