@@ -106,8 +106,8 @@ class WhiteErrors(NamedTuple):
     """Residuals of positions and timestamps against the cubic through their neighbours.
 
     ``residual_m``, shape (n, 2), is divided by the noise gain of the cubic: its σ is that of a
-    position. ``late_s``, divided by the same gain, is the residual of the timestamp's deviation from
-    a constant rate.
+    position. ``late_s``, divided by the same gain, is the residual of the deviation (s) of the
+    timestamps from a constant rate.
     """
 
     residual_m: Array

@@ -121,8 +121,7 @@ class SystematicErrors:
     @property
     def bias(self) -> Estimate:
         """Magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward = self.forward_bias
-        right = self.right_bias
+        forward, right = self.forward_bias, self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
