@@ -20,43 +20,43 @@ from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
-# Minimum number of positions for a pattern
+# Minimum number of positions in which error patterns are searched
 MIN_POSITIONS = 100
 # Rows of the neighbours of a position, relative to its row
 NEIGHBOURS = np.array([-2, -1, 1, 2])
-# Maximum time (median intervals) from the first to the last neighbour: lost positions and gaps
-# make the cubic inaccurate
+# Maximum time from the first to the last neighbour, in median intervals: across gaps the cubic
+# interpolation is inaccurate
 MAX_NEIGHBOUR_SPAN = 8.0
-# Maximum factor between the noise of a residual and that of a position
-MAX_RESIDUAL_FACTOR = 4.0
-# Number of timestamps in the running median that jitter does not shift, but a lost position does
-MEDIAN_COUNT = 9
+# Residuals whose σ exceeds this multiple of the position σ are not used
+MAX_RESIDUAL_NOISE_GAIN = 4.0
+# Number of timestamps in the running median: it follows lost positions, but not jitter
+MEDIAN_TIMESTAMP_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Number of successive residuals that share neighbours, so that only one of them is independent
+# Number of residuals per independent residual: successive residuals share neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
-# Minimum and maximum ratio of the residuals to jitter · velocity, if jitter causes them
+# Jitter causes the residuals if their ratio to jitter · velocity is in this range
 JITTER_RATIOS = 0.6, 1.5
-# Minimum ratio of the errors by jitter to all white errors
+# Minimum fraction of the white errors (RMS) that jitter must explain
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
 # Number of flight parts in which the growth with speed is tested, and its minimum median
 # significance (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
-# Fractions of the positions that are slow and fast
+# Speed quantiles: below the first the vehicle is slow, above the second it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
-# Minimum ratio of the noises at high and low speed, along and across the motion
+# Noise grows with speed if it is larger by this factor at high speed, along and across the motion
 MIN_SPEED_NOISE_RATIO = 1.6
-# Minimum extent (m, RMS) of the motion for a fit to ground truth
+# Minimum extent (m, RMS) of a path whose errors are fitted to ground truth
 MIN_PATH_RMS_M = 0.5
 # Length (s) of the running mean that is removed from the errors of odometry, which drifts
 DRIFT_WINDOW_S = 12.0
 # Length (s) of the flight parts with separate time offsets
 OFFSET_PART_S = 4.0
-# Minimum speed (m/s, RMS of a part) for a time offset of the part
+# Minimum RMS speed (m/s) of a flight part whose time offset is estimated
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
@@ -73,7 +73,7 @@ MIN_AMPLITUDE_SIGMAS = 1.0
 MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz)
 MAX_FREQUENCY_HZ = 2.0
-# Maximum ratio of the sinusoid in the motion to the RMS extent of the motion
+# Maximum fraction of the mean square motion at the frequency of a sinusoidal error
 MAX_MOTION_FRACTION = 0.1
 # Interval (s) and limit (s) of the tested delays of the logged attitude
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
@@ -85,7 +85,7 @@ MAX_ROTATIONS = 20_000
 ROTATION_STEP_S = 0.1
 # Maximum difference (rad) of rotations: larger differences are resets of the attitude
 MAX_ROTATION_RAD = 0.2
-# Maximum ratio of the mean square rotation differences with and without the delay
+# A delay of the attitude must reduce the mean square rotation difference to this fraction
 MAX_DELAYED_RATIO = 0.5
 # Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
@@ -103,10 +103,11 @@ class SpeedNoise(NamedTuple):
 
 
 class WhiteErrors(NamedTuple):
-    """Residuals of positions against the cubic through their neighbours.
+    """Residuals of positions and timestamps against the cubic through their neighbours.
 
-    ``residual_m``, shape (n, 2), is scaled to the noise of a position. ``late_s`` is the deviation
-    of the timestamp from a constant interval, relative to the neighbours and scaled likewise.
+    ``residual_m``, shape (n, 2), is divided by the noise gain of the cubic: its σ is that of a
+    position. ``late_s``, divided by the same gain, is the residual of the deviation (s) of the
+    timestamps from a constant rate.
     """
 
     residual_m: Array
@@ -132,7 +133,7 @@ class ErrorFit(NamedTuple):
 
     @property
     def slow_square_m2(self) -> float:
-        """Sum of the mean squares of both axes, without white noise."""
+        """Mean square slow error (m²), summed over both axes; the white noise is subtracted."""
         return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
 
 
@@ -165,7 +166,7 @@ def _positions(comparison: Comparison) -> tuple[Array, Array]:
 
 
 def white_errors(comparison: Comparison) -> WhiteErrors | None:
-    """Compare each position with the cubic through its neighbours; None if there are too few."""
+    """Compare each position with the cubic through its neighbours; None with too few positions."""
     time_s, position_m = _positions(comparison)
     if len(time_s) < MIN_POSITIONS:
         return None
@@ -181,17 +182,20 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     for row in range(len(NEIGHBOURS)):
         for other in set(range(len(NEIGHBOURS))) - {row}:
             weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
-    factor = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     phase_s = time_s - interval_s * np.arange(len(time_s))
-    late_s = phase_s - median_filter(phase_s, MEDIAN_COUNT, mode="nearest")
-    half = max(2, round(HALF_VELOCITY_S / interval_s))
-    first, last = np.clip(rows - half, 0, None), np.clip(rows + half, None, len(time_s) - 1)
+    late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
+    half_window_rows = max(2, round(HALF_VELOCITY_S / interval_s))
+    first, last = (
+        np.clip(rows - half_window_rows, 0, None),
+        np.clip(rows + half_window_rows, None, len(time_s) - 1),
+    )
     velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
-    is_accurate = factor < MAX_RESIDUAL_FACTOR
+    is_accurate = noise_gain < MAX_RESIDUAL_NOISE_GAIN
 
     def residual(values: Array) -> Array:
         interpolated = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled = ((values[rows] - interpolated).T / factor).T
+        scaled = ((values[rows] - interpolated).T / noise_gain).T
         return np.asarray(scaled[is_accurate])
 
     return WhiteErrors(residual(position_m), velocity_m_s[is_accurate], residual(late_s))
@@ -317,7 +321,7 @@ def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return the sinusoid that explains most of the slow errors, unless it is in the motion."""
+    """Return the sinusoid that explains most of the slow errors; None if the motion contains it."""
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
     frequencies_hz = np.arange(MIN_PERIODS / duration_s, highest_hz, 0.2 / duration_s)
@@ -379,24 +383,27 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
     """Return the time (s) by which the logged attitude is late, if it is not zero."""
-    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    start_s, end_s = max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1])
+    imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    start_s, end_s = (
+        max(imu_time_s[0], attitude_time_s[0]),
+        min(imu_time_s[-1], attitude_time_s[-1]),
+    )
     time_s = np.arange(start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, DELAY_STEP_S)
     time_s = time_s[:MAX_ROTATIONS]
-    step = round(ROTATION_STEP_S / DELAY_STEP_S)
+    step_rows = round(ROTATION_STEP_S / DELAY_STEP_S)
     if len(time_s) < MIN_POSITIONS:
         return None
-    quaternions = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    rotation_rad = to_vector(multiply(conjugate(quaternions[:-step]), quaternions[step:]))
-    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_s)
+    quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
+    rotation_rad = to_vector(multiply(conjugate(quaternions[:-step_rows]), quaternions[step_rows:]))
+    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
     def difference(delay_s: float) -> float:
-        angles = [np.interp(time_s - delay_s, imu_s, column) for column in angle_rad.T]
+        angles = [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
         differences_rad = (
-            rotation_rad - (np.array(angles)[:, step:] - np.array(angles)[:, :-step]).T
+            rotation_rad - (np.array(angles)[:, step_rows:] - np.array(angles)[:, :-step_rows]).T
         )
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
-        # resets of the attitude are larger than the rotations of a multicopter
+        # limit each difference: resets of the attitude exceed the rotations of a multicopter
         sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
         return float(np.mean(sizes_rad**2))
 
