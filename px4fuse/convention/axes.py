@@ -127,8 +127,8 @@ class SentPositions:
     max_offset_s: float
     barometer: tuple[Array, Array] | None = None
 
-    def with_clock_drift(self, drift: float) -> "SentPositions":
-        return replace(self, time_s=without_clock_drift(self.time_s, drift))
+    def with_clock_drift(self, clock_drift: float) -> "SentPositions":
+        return replace(self, time_s=without_clock_drift(self.time_s, clock_drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
@@ -198,10 +198,10 @@ class Hypothesis:
         return bool(is_similar and (self.assignment, self.unit) == (other.assignment, other.unit))
 
 
-def without_clock_drift(time_s: Array, drift: float) -> Array:
+def without_clock_drift(time_s: Array, clock_drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
-    middle_s = float(np.mean(time_s))
-    return middle_s + (time_s - middle_s) / (1.0 + drift)
+    mean_time_s = float(np.mean(time_s))
+    return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
 def search(
@@ -283,8 +283,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
     score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
     score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
-    rotation_angle = np.angle(correlation)
-    nearest_quarter_turns = np.round(rotation_angle / (np.pi / 2.0)).astype(int) % 4
+    rotation_rad = np.angle(correlation)
+    nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
     for quarter_turns in range(4):
         scores_at_quarter = np.where(
@@ -303,7 +303,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
                 + UNIT_ODDS * (unit_name != "m")
             )
             parameters = np.array(
-                [offset_s[offset_index], rotation_angle[offset_index, assignment_index], *[0.0] * 5]
+                [offset_s[offset_index], rotation_rad[offset_index, assignment_index], *[0.0] * 5]
             )
             hypotheses.append(Hypothesis(assignment, unit_name, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
@@ -335,11 +335,11 @@ def _evaluate_hypothesis(
     hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
-    offset_s, rotation_angle, heading_drift, clock_drift = hypothesis.parameters[:4]
+    offset_s, rotation_rad, heading_drift_rad_s, clock_drift = hypothesis.parameters[:4]
     accelerometer_bias, time_s = hypothesis.parameters[4:], source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
-    middle_s = float(np.mean(time_s))
-    grid_position = time_s - offset_s - clock_drift * (time_s - middle_s)
+    mean_time_s = float(np.mean(time_s))
+    grid_position = time_s - offset_s - clock_drift * (time_s - mean_time_s)
     grid_position = (grid_position - imu_motion.time_s[0]) / GRID_INTERVAL_S
     grid_index = np.clip(np.floor(grid_position).astype(int), 0, len(imu_motion.time_s) - 2)
     is_used = (
@@ -361,7 +361,7 @@ def _evaluate_hypothesis(
         hypothesis.assignment,
     )
     unit_m = UNITS[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * elapsed_s))
+    complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -402,7 +402,7 @@ def _evaluate_hypothesis(
     jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
-    jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
+    jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
     jacobian[..., 4:] = imu_table[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_free = np.array(

@@ -66,13 +66,13 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
     time_s, true_samples = position_samples.index.to_numpy(), truth.samples
-    true_m = [
+    true_positions_m = [
         np.interp(time_s, true_samples.index, true_samples[name], np.nan, np.nan)
         for name in columns
     ]
-    error_m = position_samples.to_numpy() - np.transpose(true_m)
+    error_m = position_samples.to_numpy() - np.transpose(true_positions_m)
     # a delay is estimated too (error = velocity · delay), because it resembles a lever arm
-    velocity_m_s = np.gradient(np.transpose(true_m), time_s, axis=0)
+    velocity_m_s = np.gradient(np.transpose(true_positions_m), time_s, axis=0)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
     identity_columns = np.broadcast_to(np.eye(2), rotation.shape)

@@ -94,12 +94,12 @@ class SourceMotion:
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         at_s = grid_s[0] + GRID_INTERVAL_S * np.arange(-window_steps, len(grid_s) + window_steps)
-        is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        has_near_samples = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
         columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
         is_valid = (
-            is_near[2 * window_steps :]
-            & is_near[window_steps:-window_steps]
-            & is_near[: -2 * window_steps]
+            has_near_samples[2 * window_steps :]
+            & has_near_samples[window_steps:-window_steps]
+            & has_near_samples[: -2 * window_steps]
         )
         return cls(grid_s, high_pass(second_difference(columns, window_steps), is_valid), is_valid)
 
@@ -260,8 +260,8 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half_angle = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half_angle)
+    half_turn_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half_turn_rad)
     return multiply(
-        np.stack([np.cos(half_angle), zeros, zeros, np.sin(half_angle)], axis=-1), attitude
+        np.stack([np.cos(half_turn_rad), zeros, zeros, np.sin(half_turn_rad)], axis=-1), attitude
     )

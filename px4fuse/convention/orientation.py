@@ -107,11 +107,13 @@ def check_orientation(
     return convention, sample_s, to_attitude(sent_quaternions, convention)
 
 
-def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
+def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
     """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
-    world, body = FRAMES[convention.frames]
-    w_first = sent if convention.order == "w x y z" else np.roll(sent, 1, 1)
-    return multiply(multiply(world, w_first), body)
+    world_rotation, body_rotation = FRAMES[convention.frames]
+    w_first_quaternions = (
+        sent_quaternions if convention.order == "w x y z" else np.roll(sent_quaternions, 1, 1)
+    )
+    return multiply(multiply(world_rotation, w_first_quaternions), body_rotation)
 
 
 def _make_candidate(

@@ -349,10 +349,10 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
-    replayed_rad = np.interp(
+    replayed_at_log_times_rad = np.interp(
         logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
     )
-    difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged_state))))
+    difference_rad = np.angle(np.exp(1j * (replayed_at_log_times_rad - heading_rad(logged_state))))
     return float(np.degrees(rms(difference_rad)))
 
 
