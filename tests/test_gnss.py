@@ -201,7 +201,7 @@ def test_compare_of_gnss_flight_uses_gnss_innovations(tmp_path):
     np.testing.assert_allclose(north["innovation_m"], -logged[:, 0], rtol=1e-6)
     np.testing.assert_allclose(north["observation_variance_m2"], 0.16, rtol=1e-6)
     assert isinstance(down, Unavailable)
-    assert down.reason == "EKF2 never fused GNSS for height in this log"
+    assert down.reason == "EKF2 never fused the height from GNSS in this log"
     assert ekf2.innovation_topics == ("estimator_aid_src_gnss_pos",)
     assert ekf2.gate == 5.0
     # the flight itself is unchanged

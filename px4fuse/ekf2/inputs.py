@@ -28,7 +28,7 @@ from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
     FLOW,
-    GNSS_MODE,
+    GNSS_MODE_PARAMETER,
     GNSS_POS,
     GNSS_VEL,
     MAG,
@@ -380,7 +380,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
     rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
         # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
-        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE not in parameters)
+        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude:
             # the flag stays set for 10 s (BADACC_PROBATION, common.h)
             rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0)

@@ -17,8 +17,8 @@ from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import (
-    IMU_GAP_INTERVALS,
-    IMU_GAP_S,
+    MIN_IMU_GAP_INTERVALS,
+    MIN_IMU_GAP_S,
     Segment,
     cut_to_segment,
     imu_and_attitude,
@@ -271,7 +271,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     """Measure sample intervals above five median intervals and above 0.1 s (IMU) or 1 s."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
-        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals_s)))
+        max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
         else float(max_interval_s(1.0 / sample_rate(samples)))
     )
