@@ -31,7 +31,7 @@ MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
-UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
+UNIT_SIZES_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # Rotations (rad) of the frame about the vertical up to this angle are a misalignment
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
@@ -64,7 +64,7 @@ MAX_OFFSET_STEP_S = 0.15
 # 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
 PARAMETER_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
-CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
+CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
@@ -102,8 +102,8 @@ class AxisAssignment(NamedTuple):
     def axes(self, quarter_turns: int) -> Axes:
         """Return the directions of x, y, z with ``axis_a`` at ``quarter_turns`` from north."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        directions[self.axis_a] = CLOCKWISE[quarter_turns % 4]
-        directions[self.axis_b] = CLOCKWISE[(quarter_turns + self.handedness) % 4]
+        directions[self.axis_a] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
+        directions[self.axis_b] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
         return directions[0], directions[1], directions[2]
 
     def log_odds(self, quarter_turns: int) -> float:
@@ -267,7 +267,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     correlation -= 1j * handedness * moments[:, axis_b, 0]
     source_square, unit_sizes_m = (
         np.maximum(moments[:, 3:6, 6, None], 1e-12),
-        np.array([*UNITS.values()]),
+        np.array([*UNIT_SIZES_M.values()]),
     )
     north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
     horizontal_square = (
@@ -293,7 +293,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         for (assignment_index, unit_index), offset_index in np.ndenumerate(
             np.argmax(scores_at_quarter, axis=0)
         ):
-            unit_name, assignment = [*UNITS][unit_index], AXIS_ASSIGNMENTS[assignment_index]
+            unit_name, assignment = [*UNIT_SIZES_M][unit_index], AXIS_ASSIGNMENTS[assignment_index]
             # without heights, only the third axis can be vertical
             if assignment.vertical_axis != 2 and not source_motion.table[:, 2].any():
                 continue
@@ -360,7 +360,7 @@ def _evaluate_hypothesis(
         source_motion.table[rows[is_used]],
         hypothesis.assignment,
     )
-    unit_m = UNITS[hypothesis.unit]
+    unit_m = UNIT_SIZES_M[hypothesis.unit]
     complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
@@ -468,7 +468,7 @@ def _height_log_likelihood(
     """Return the log likelihood ratio of the barometer heights: sent heights against a constant."""
     height_m = np.interp(positions.time_s - hypothesis.offset_s, time_s, barometer_m)
     down_m = (
-        UNITS[hypothesis.unit]
+        UNIT_SIZES_M[hypothesis.unit]
         * hypothesis.assignment.vertical_sign
         * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )

@@ -8,7 +8,7 @@ from msgspec import structs
 from px4fuse.convention.axes import (
     MAX_OFFSET_S,
     SMALL_ROTATION_RAD,
-    UNITS,
+    UNIT_SIZES_M,
     Hypothesis,
     SentPositions,
     find_candidates,
@@ -195,13 +195,11 @@ def _choose_convention(
 
 
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:
-    rotation = (
-        f", rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°"
-        if hypothesis.has_rotation
-        else ""
-    )
-    axes = format_axes(hypothesis.axes, hypothesis.unit)
-    return f"{axes}{rotation}, timestamps {hypothesis.offset_s:+.1f} s late"
+    properties = [format_axes(hypothesis.axes, hypothesis.unit)]
+    if hypothesis.has_rotation:
+        properties.append(f"rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°")
+    properties.append(f"timestamps {hypothesis.offset_s:+.1f} s late")
+    return ", ".join(properties)
 
 
 def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
@@ -215,7 +213,7 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
     noise_m = (
-        UNITS[hypothesis.unit]
+        UNIT_SIZES_M[hypothesis.unit]
         * third_difference_sigma
         * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )

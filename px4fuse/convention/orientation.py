@@ -18,16 +18,16 @@ from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multi
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
-FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
-ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
 FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
-    "FLU to ENU": (ENU_NED, FRD_FLU),
-    "FLU to NWU": (FRD_FLU, FRD_FLU),
-    "FLU to NED": (IDENTITY, FRD_FLU),
-    "FRD to ENU": (ENU_NED, IDENTITY),
+    "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
+    "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
+    "FLU to NED": (IDENTITY, FLU_TO_FRD),
+    "FRD to ENU": (ENU_TO_NED, IDENTITY),
 }
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
 # Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused

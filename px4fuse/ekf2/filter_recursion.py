@@ -22,9 +22,9 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
+    HEIGHT_SENSORS,
     MIN_GATE,
     MIN_SIGMA,
-    SENSORS,
     HeightFilter,
     barometer_samples,
 )
@@ -259,7 +259,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         < np.array(
             [configuration.without.get(aid.name, np.inf) for configuration in configurations]
         )
-        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
+        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *HEIGHT_SENSORS)
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
     sample_index = np.maximum(intervals[0].events.sample, 0)

@@ -106,7 +106,7 @@ class FusionAttempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later, where this source has its own parameter to enable it."""
+        """True for PX4 v1.14 and later, with a separate parameter that enables the source."""
         return self.aid.switch in self.parameters
 
     @property
@@ -250,7 +250,10 @@ def _check_quality(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         f"{max(median_quality, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
-        reason += " The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
+        reason = (
+            f"{reason} The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses "
+            "0."
+        )
         action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
@@ -284,14 +287,14 @@ def _check_alignment(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         )
     needs_no_heading = attempt.is_vision and attempt.has_switch and attempt.source.frame == "FRD"
     if not needs_no_heading and attempt.fraction_set("yaw_align") < 0.5:
-        heading_action = "Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"
+        actions = ["Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"]
         if attempt.is_vision:
-            heading_action += ", or send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL"
+            actions.append("send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL")
         yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its heading",
             "The flag cs_yaw_align is 0. EKF2 needs a heading to fuse positions relative to north.",
-            f"{heading_action}.",
+            f"{', or '.join(actions)}.",
         )
 
 

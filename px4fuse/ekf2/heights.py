@@ -35,8 +35,8 @@ from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step
 
 # Indices of vertical velocity and height in the state
 VELOCITY_DOWN, DOWN = 5, 8
-SENSORS = (BAROMETER, GNSS_HGT)
-HEIGHT_AIDS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
+HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
+HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 # Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
 DEFAULT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
@@ -66,7 +66,7 @@ def add_heights(
         for name, log in ekf2.aids.items()
         if log.enabled is not None
     }
-    fused_aids = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
+    fused_aids = [aid.name for aid in HEIGHT_SENSORS if enabled_fractions.get(aid.name) == 1.0]
     for aid in HEIGHT_AIDS:
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
@@ -199,10 +199,10 @@ class HeightFilter:
         )
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
-        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
+        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
-        self.has_bias = [aid.name != heights.reference for aid in SENSORS]
+        self.has_bias = [aid.name != heights.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
         bias_m, bias_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]

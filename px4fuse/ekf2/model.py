@@ -234,10 +234,12 @@ def replay_settings(
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
-        height_note = f"; {height_text}" if inputs.logged_height_reason else ""
+        fused_text = ", ".join(fused_aids)
+        if inputs.logged_height_reason:
+            fused_text = f"{fused_text}; {height_text}"
         raise SettingsError(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
-            f"{', '.join(fused_aids)}{height_note}."
+            f"{fused_text}."
         )
     if not changes:
         return ()

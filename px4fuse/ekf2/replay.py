@@ -357,7 +357,7 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of the other aiding sources, and the reason of each disagreement."""
+    """Return the agreement of aiding sources except the position, and reasons of disagreement."""
     agreements: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():

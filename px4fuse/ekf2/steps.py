@@ -37,7 +37,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
-OTHER_TIME = Unavailable(
+NO_TRUTH_OVERLAP = Unavailable(
     "RMSE against ground truth",
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
@@ -57,14 +57,15 @@ GATE = "rejections and resets"
 OUTPUT = "output predictor"
 # Step of each further aiding source of the position, by PX4's name of the source
 FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
-# Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
+# Order in which properties of KF are replaced by properties of EKF2; steps of further aiding
+# sources are inserted before GATE
 REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Replacement of one property of KF by that of EKF2, and its effect.
+    """Effect of replacing one property of KF by the same property of EKF2.
 
     Attributes
     ----------
@@ -219,7 +220,7 @@ def explain_by_steps(
     )
     truth = model.flight.truth
     steps_by_axis = {}
-    no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
+    no_truth = NO_TRUTH_OVERLAP if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = (
             state_at(kf_runs[axis], state_times_s) if kf_runs else tracks_by_step[0][axis_index]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
-from px4fuse.ekf2.heights import SENSORS
+from px4fuse.ekf2.heights import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -65,7 +65,7 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Use the logged height (vehicle_local_position) instead of a replayed height.",
 )
-HEIGHT_NAMES = {aid.name for aid in SENSORS}
+HEIGHT_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
