@@ -254,10 +254,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
-    offset_s, moments = (
-        (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S,
-        moments[has_overlap],
-    )
+    offset_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
+    moments = moments[has_overlap]
     independent_count = moments[:, 6, 6, None, None] * (GRID_INTERVAL_S / DIFFERENCE_WINDOW_S)
     moments /= moments[:, 6:, 6:]
     vertical_axis, vertical_sign, axis_a, axis_b, handedness = np.array(AXIS_ASSIGNMENTS).T
@@ -265,10 +263,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         moments[:, axis_a, 0] + handedness * moments[:, axis_b, 1] + 1j * moments[:, axis_a, 1]
     )
     correlation -= 1j * handedness * moments[:, axis_b, 0]
-    source_square, unit_sizes_m = (
-        np.maximum(moments[:, 3:6, 6, None], 1e-12),
-        np.array([*UNIT_SIZES_M.values()]),
-    )
+    source_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
+    unit_sizes_m = np.array([*UNIT_SIZES_M.values()])
     north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
     horizontal_square = (
         unit_sizes_m**2 * (source_square[:, axis_a] + source_square[:, axis_b])
@@ -356,10 +352,8 @@ def _evaluate_hypothesis(
     imu_table = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
-    sent_differences, (vertical_axis, vertical_sign, axis_a, axis_b, handedness) = (
-        source_motion.table[rows[is_used]],
-        hypothesis.assignment,
-    )
+    sent_differences = source_motion.table[rows[is_used]]
+    vertical_axis, vertical_sign, axis_a, axis_b, handedness = hypothesis.assignment
     unit_m = UNIT_SIZES_M[hypothesis.unit]
     complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
@@ -378,8 +372,9 @@ def _evaluate_hypothesis(
     log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
     vertical_log_likelihood, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
     is_axis_known = sent_differences.any(axis=0)  # False for the height if the source has none
-    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis]
-    log_likelihood_gain += np.log(unit_m) * np.count_nonzero(is_axis_known)
+    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
+        unit_m
+    ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
         student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_axis_known]
     )
@@ -408,10 +403,8 @@ def _evaluate_hypothesis(
     is_free = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
-    weights, columns = (
-        weight[[0, 0, 1]].T.ravel(),
-        jacobian[..., is_free].reshape(-1, is_free.sum()),
-    )
+    weights = weight[[0, 0, 1]].T.ravel()
+    columns = jacobian[..., is_free].reshape(-1, is_free.sum())
     weighted_columns = columns.T * weights
     normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRECISION[is_free] + 1e-9)
     gradient = (

@@ -117,10 +117,8 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
         source_motion = SourceMotion.of(time_s, position_samples.to_numpy(), imu_motion.time_s)
         is_used = is_used & source_motion.is_valid
         difference_m = source_motion.table - imu_motion.table[:, :2, 0]
-        design_rows, used_differences_m = (
-            design[is_used].reshape(-1, design.shape[2]),
-            difference_m[is_used].ravel(),
-        )
+        design_rows = design[is_used].reshape(-1, design.shape[2])
+        used_differences_m = difference_m[is_used].ravel()
         # second differences overlap over twice the window, so only these are independent
         independent_count = len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
         if independent_count < 2 * design_rows.shape[1]:

@@ -204,10 +204,8 @@ def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     """Return the centred running mean over ``width`` rows, without invalid rows."""
     rows = np.arange(len(values))
-    first_rows, end_rows = (
-        np.clip(rows - width // 2, 0, None),
-        np.clip(rows + width // 2 + 1, None, len(rows)),
-    )
+    first_rows = np.clip(rows - width // 2, 0, None)
+    end_rows = np.clip(rows + width // 2 + 1, None, len(rows))
     valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
     cumulative = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
     cumulative = np.concatenate([np.zeros_like(cumulative[:1]), cumulative])

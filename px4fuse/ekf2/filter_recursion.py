@@ -724,7 +724,7 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
     tilt and accelerometer bias. The correlations are estimated from the flight before the segment.
     """
     state_correlation = _settled_state_correlation(segment)
-    if (history := segment.history) is not None:
+    if history := segment.history:
         inputs = replace(inputs, vision=None)
         configuration = FilterConfiguration(inputs.settings)
         history = replace(history, state_correlation=_settled_state_correlation(history))

@@ -250,10 +250,7 @@ def _check_quality(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         f"{max(median_quality, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
-        reason = (
-            f"{reason} The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses "
-            "0."
-        )
+        reason = f"{reason} MAVLink VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
         action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
@@ -326,14 +323,11 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         name, parameter, unit = GNSS_CHECKS[bit]
         check_details = [f"{100.0 * fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            median_value = (
-                float(np.sqrt(reported_variances[bit].median()))
-                if bit in reported_variances
-                else np.nan
-            )
             # the samples contain only positions with a fix, so their median may be below the limit
-            if median_value > limit:
-                check_details.append(f"median {median_value:.2f}{unit}")
+            if bit in reported_variances:
+                median_value = float(np.sqrt(reported_variances[bit].median()))
+                if median_value > limit:
+                    check_details.append(f"median {median_value:.2f}{unit}")
             check_details.append(f"limit {parameter} {limit:g}{unit}")
         check_texts.append(f"{name} ({', '.join(check_details)})")
     yield UnmetCondition(

@@ -396,7 +396,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
 def replayed_aid(ekf2: Ekf2) -> Aid:
     """Return the position source to replay: GNSS if EKF2 fused GNSS, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
-    is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
+    is_vision_used = bool(vision and (vision.enabled is None or vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
     return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
@@ -406,7 +406,7 @@ def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     aid_log = ekf2.aids.get(aid.name)
     return (
         aid_log.enabled
-        if aid_log is not None and aid_log.enabled is not None and aid_log.enabled.any()
+        if aid_log and aid_log.enabled is not None and aid_log.enabled.any()
         else None
     )
 
@@ -585,10 +585,8 @@ def _logged_decisions(
     is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
-    last_fused_rows, dead_reckoning_ends = (
-        rejection_rows[: len(fusion_to_row_s), 0] - 1,
-        rejection_rows[len(fusion_to_row_s) :, 1] - 1,
-    )
+    last_fused_rows = rejection_rows[: len(fusion_to_row_s), 0] - 1
+    dead_reckoning_ends = rejection_rows[len(fusion_to_row_s) :, 1] - 1
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):

@@ -299,10 +299,8 @@ def _compare_innovations(
     is_used = (matched_updates >= 0) & inside_spans(logged_innovations.index, replay.evaluated_s)
     # a sample to which EKF2 resets its state is logged with innovation 0
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
-    logged_innovations, replayed_innovations = (
-        logged_innovations[is_used],
-        replayed_innovations.iloc[matched_updates[is_used]],
-    )
+    logged_innovations = logged_innovations[is_used]
+    replayed_innovations = replayed_innovations.iloc[matched_updates[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
