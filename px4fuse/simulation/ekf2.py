@@ -172,7 +172,7 @@ def simulate_ekf2(
         mean_step_s=step_s,
         horizon_s=(buffer_length - 1) * step_s,
         configured_step_s=PREDICTION_STEP_US * 1e-6,
-        vision_height=False,
+        fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
         max_interval_s=MAX_EVENT_INTERVAL_S,
@@ -242,7 +242,7 @@ def _make_segment(
             down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
             state_correlation=covariance / sigma[:, None] / sigma,
-            fusing=False,
+            is_fusing=False,
         ),
         step_us,
         true_quaternions,
@@ -293,7 +293,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     else:
         position_variance, velocity_variance = fields["position_variance"][is_newer], None
     return ReceivedPositions(
-        stamp_s=timestamp_s[is_newer],
+        timestamp_s=timestamp_s[is_newer],
         arrival_s=arrival_s[is_newer],
         position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),

@@ -319,7 +319,7 @@ def _flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
     for step, next_attempt_s in zip(
         events.end_step[fusion_attempts].tolist(), next_attempts_s.tolist(), strict=True
     ):
-        stop_s = time_s[step] + model_inputs.rules.stop_s
+        stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
         is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
     is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_HZ)
