@@ -59,7 +59,7 @@ from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 that the diagnosis card states
+# Minimum fraction of positions rejected by EKF2; with fewer the card does not mention rejections
 MIN_NAMED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
@@ -70,8 +70,8 @@ DRIFT_HIDES_ERROR = (
 HEAD_BYTE_COUNT = 4  # number of printed bytes from the start of an unreadable log
 ULOG_HEAD_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_HIDES_ERROR = (
-    "KF and EKF2 rotate the measured acceleration by the wrong heading. Each update corrects the "
-    "position, so innovations show little of the position error."
+    "KF and EKF2 rotate the measured acceleration by the wrong heading. Each measurement corrects "
+    "the position, so innovations show little of the position error."
 )
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
@@ -80,7 +80,7 @@ UNEXPLAINED_DIFFERENCE = (
 SENTENCES_BY_SOURCE_FAULTS = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
-        "KF uses the corrected axes, unit and orientation of the source. EKF2 used them as sent.",
+        "KF uses the corrected positions of the source. EKF2 used the uncorrected positions.",
     ),
     (
         {
@@ -182,7 +182,7 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
         first_bytes = read_head(path, HEAD_BYTE_COUNT, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
         facts["read"] = (
-            f"{size_bytes:,} bytes; the file begins with {first_bytes}, a ULog with "
+            f"{size_bytes:,} bytes; the file begins with {first_bytes}, but a ULog begins with "
             f"{ULOG_HEAD_BYTES}"
         )
     if error.remedy:
@@ -224,17 +224,17 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
 
 
 def _make_effect(analysis: Analysis) -> Effect:
-    result, difference = analysis.main, analysis.main.difference
-    reset_count, segment = None, analysis.segment.flight
+    comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
+    difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
         resets_s = horizontal_resets_s(analysis.flight.ekf2)
         reset_count = int(((segment.start_s < resets_s) & (resets_s <= segment.end_s)).sum())
     return Effect(
-        axis=describe_axis(analysis, result),
-        position_rmse_m=_position_rmse_m(result),
+        axis=describe_axis(analysis, comparison),
+        position_rmse_m=_position_rmse_m(comparison),
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
-        rejected_fraction=result.rejected_fraction,
+        rejected_fraction=comparison.rejected_fraction,
         horizontal_resets=reset_count,
     )
 
@@ -308,16 +308,16 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
     results = (analysis.main, *analysis.secondary_axes)
-    errors_by_axis = [
+    nees_with_results = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results
         if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
         and truth.nees_position_mean
         and not (truth.is_lag_only and result is not analysis.main)
     ]
-    if not errors_by_axis:
+    if not nees_with_results:
         return []
-    nees, worst_result, rmse_m = max(errors_by_axis, key=lambda errors: errors[0])
+    nees, worst_result, rmse_m = max(nees_with_results, key=lambda item: item[0])
     ratio = math.sqrt(nees)
     is_overconfident = classify_sigma_ratio(ratio, "truth") == "overconfident"
     if worst_result is analysis.main or not is_overconfident:
@@ -374,7 +374,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark inconsistent verdicts on filters that need no change."""
+    """Set ``is_explained`` for filters that are inconsistent, but need no change of settings."""
     unchanged_filters = {
         name
         for cause in causes
@@ -393,7 +393,7 @@ def _mark_explained(
         and (
             FILTER_NAMES[verdict.filter] in unchanged_filters
             or verdict.filter in filters_consistent_with_truth
-            # drift does not change innovations, so a small NIS is not a fault
+            # innovations do not show drift, so a small NIS does not prove a too large σ
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -404,7 +404,7 @@ def _mark_explained(
 def _reconcile(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Mark explained verdicts, and explain verdicts that differ."""
+    """Explain why verdicts against source and ground truth differ."""
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_drift)
     *other_verdicts, ekf2_verdict = sigma_verdicts
@@ -417,9 +417,8 @@ def _reconcile(
     ratio = math.sqrt(horizon_nees or math.inf)
     if classify_sigma_ratio(ratio, "truth") == "consistent":
         return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
-            "EKF2's published position lags because of its output predictor, and σ does not "
-            "include this lag. At the fusion horizon, EKF2's position error is "
-            f"{format_ratio(ratio)} times σ: consistent."
+            "EKF2's published position lags behind the estimate from which EKF2 computes σ. The "
+            f"error of this estimate is {format_ratio(ratio)} times σ: consistent."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
     if explanation == UNEXPLAINED_DIFFERENCE:
@@ -460,9 +459,9 @@ def _explain_differing_verdicts(
     if corrected_filters.issuperset(differing_filters):
         filter_labels = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing_filters)
         return (
-            f"The verdicts of {filter_labels} against source and ground truth differ: innovations "
-            "hardly show this fault. The re-run with the first action removes most of the position "
-            "error."
+            f"The verdicts on {filter_labels} against source and ground truth differ, because "
+            "innovations show little of this fault. The first action of this card removes most of "
+            "the position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -470,13 +469,13 @@ def _explain_differing_verdicts(
         noise_m = sigma_z and (sigma_z.value or sigma_z.high)
         noise_text = f" of {format_metres(noise_m)} m" if noise_m else ""
         return (
-            f"The position noise{noise_text} is smaller than KF and EKF2 assume. Only ground truth "
-            "shows the drift of the source."
+            f"The position noise{noise_text} is smaller than KF and EKF2 assume, so innovations "
+            "are small. Only ground truth shows the drift of the source."
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
-            "Innovations show only position errors that change from sample to sample. KF and "
-            "EKF2 follow slow position errors, so only ground truth shows them."
+            "KF and EKF2 follow position errors that change slowly. Innovations do not show slow "
+            "errors; only ground truth does."
         )
     has_heading_error = "ekf2_heading_error" in finding_ids
     explanation = HEADING_HIDES_ERROR if has_heading_error else UNEXPLAINED_DIFFERENCE
@@ -486,14 +485,14 @@ def _explain_differing_verdicts(
 
 def _gate_sentence(analysis: Analysis) -> str:
     innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # without innovations EKF2 has no verdict
+    assert not isinstance(innovations, Unavailable)  # the caller has a verdict from innovations
     is_rejected = innovations["rejected"] > 0.0
     accepted = innovations[~is_rejected]
     nis = float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
     return (
-        f"EKF2's gate rejected {int(is_rejected.sum())} of {len(innovations)} positions, which its "
-        "mean NIS includes. Without them, the RMS of EKF2's innovation ÷ √S is "
-        f"{format_ratio(math.sqrt(nis))}."
+        f"EKF2's gate rejected {int(is_rejected.sum())} of {len(innovations)} positions. The mean "
+        "NIS of EKF2 includes the rejected positions. Without them, the RMS of EKF2's "
+        f"innovation ÷ √S is {format_ratio(math.sqrt(nis))}."
     )
 
 
@@ -509,8 +508,8 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The fault affects KF and EKF2 equally, so their difference does "
-            "not show the fault."
+            f"{difference_text}. The fault affects KF and EKF2 equally, so the position "
+            "difference does not show the fault."
         )
     difference_after_by_filter = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
@@ -519,8 +518,11 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     difference_after_m = difference_after_by_filter.get("ekf2" if is_ekf2 else "kf")
     if difference_after_m is None:
         return f"{difference_text}."
-    suffix = "predicted with EKF2" if is_ekf2 else "with KF"
-    return f"{difference_text}; {format_metres(difference_after_m)} m {suffix} corrected."
+    corrected_filter = "EKF2 (predicted by replay)" if is_ekf2 else "KF"
+    return (
+        f"{difference_text}; {format_metres(difference_after_m)} m after correcting "
+        f"{corrected_filter}."
+    )
 
 
 def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:

@@ -62,8 +62,8 @@ TARGETS_BY_ID: Mapping[str, Target] = {
 class RankedCause(NamedTuple):
     """Finding with its re-runs, and with the keys that sort the causes on the card.
 
-    Causes with a small ``tier`` are first, and in each tier those with a large ``reduction`` of
-    |ln σ ratio| by the re-runs.
+    ``tier``: priority, 0 first. ``reduction``: approach of the σ ratio to 1 by the re-runs (change
+    of |ln σ ratio|), the largest first in each tier.
     """
 
     finding: Finding
@@ -97,7 +97,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.tier,
-            # a changed setting may only hide a fault of the position source
+            # settings after faults of the source, because a changed setting may only hide a fault
             cause.tier in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.reduction,
         ),
@@ -105,8 +105,8 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
 
 
 def _is_setting_fault(finding: Finding) -> bool:
-    kinds = CATALOGUE[finding.id].reruns
-    return bool(kinds) and kinds <= SETTING_CHANGE_KINDS
+    rerun_kinds = CATALOGUE[finding.id].reruns
+    return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
 def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
@@ -122,7 +122,7 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the best re-run of each filter and kind of change that tests a finding."""
+    """Return the re-runs that test a finding, for each filter and kind of change the best one."""
     kinds = CATALOGUE[finding.id].reruns
     kinds |= {"defaults"} if "noises" in kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
@@ -134,7 +134,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return True if innovations or ground truth show the effect of a re-run."""
+    """Return False if only ground truth could show the effect of a re-run, and the log has none."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
@@ -165,7 +165,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Describe a fault on the card, with the action of the finding and without re-runs."""
+    """Describe a fault for which there are no re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -199,9 +199,7 @@ def _make_actions(
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         add_or_subtract = lower_first(format_shift(shift_s))
-        sender_actions = [
-            Action("sender", f"{add_or_subtract} the timestamp (usec) of each position")
-        ]
+        sender_actions = [Action("sender", f"{add_or_subtract} the timestamp of each position")]
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
     if offset_trial and delay_trial:
@@ -254,11 +252,13 @@ def _no_change_reason(
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
         if filter_name == "kf":
-            return "no option of KF rejects outliers; do not increase SIGMA_Z (--sigma-z) instead"
+            return (
+                "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
+            )
         if word_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
-    effect = "removes drift" if finding.id == "source_drift" else "corrects this fault"
-    return f"no setting {effect}"
+    removed = "drift of the source" if finding.id == "source_drift" else "this fault"
+    return f"no setting removes {removed}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
@@ -272,7 +272,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` are default settings that make KF consistent, too.
+    ``default_settings`` are defaults with which KF is consistent as well, or empty.
     """
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
@@ -336,12 +336,12 @@ def _closing_sentence(
 ) -> str:
     if alternatives:
         return (
-            "Take only one of these actions: both correct the same time offset, with opposite "
-            "signs. --clock-offset (s) is added to the timestamps, the delay parameter (ms) is "
-            "the age of a position."
+            "Take only one of these actions, because both correct the same time offset. Their "
+            "signs are opposite: a delay parameter (ms) is the age of a position, and is "
+            "subtracted from the timestamp."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return "KF is consistent with the default noises, and with the estimated noises."
+        return "KF is consistent with the default noises as well as with the estimated noises."
     tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
@@ -349,7 +349,7 @@ def _closing_sentence(
             if (tuning.sigma_z.low or 0.0) <= default_m <= (tuning.sigma_z.high or 0.0):
                 return (
                     f"PX4's default of {default_m:g} m is inside the 95 % interval of the "
-                    "estimate, so it is equally good."
+                    "estimate, so the default is as good as the estimate."
                 )
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean

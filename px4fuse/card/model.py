@@ -50,7 +50,7 @@ class Verdict(Record, kw_only=True):
     reason : str
         Reason why the verdict is "not evaluated".
     is_explained : bool
-        True if the filter is inconsistent but needs no change.
+        True if the filter is inconsistent, but its settings need no change.
     """
 
     filter: FilterName
@@ -201,7 +201,8 @@ class Identity(Record, kw_only=True):
 class AidRow(Record, kw_only=True):
     """RMS of innovation ÷ √S along one axis of an EKF2 aiding source.
 
-    ``is_usual`` is True if PX4's default noise of this aiding source is usually too large.
+    ``is_usual`` is True if a small ratio is no fault: PX4's default noise of this aiding source is
+    larger than the noise of usual sensors.
     """
 
     label: str
@@ -220,11 +221,11 @@ class Card(Record, kw_only=True):
     reconcile : str
         Explanation if two verdicts on one filter differ.
     difference : str
-        Position difference KF - EKF2 before and after the first fix.
+        Position difference KF - EKF2, and its value in a re-run with the first cause corrected.
     more_causes : int
         Number of causes beyond :data:`MAX_CAUSES`, which ``causes`` does not contain.
     facts : mapping from label to str
-        Other texts, for example the fix for a log that cannot be read.
+        Texts without own field, for example "fix" for a log that cannot be read.
     """
 
     severity: CardSeverity

@@ -13,7 +13,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
 
-# Length (s) of the bootstrap blocks: longer than the correlation time of position errors
+# Length (s) of the bootstrap blocks: longer than the usual correlation time of position errors
 BOOTSTRAP_BLOCK_S = 10.0
 BOOTSTRAP_RESAMPLES = 2000
 # Minimum number of bootstrap blocks: with fewer the 95 % interval is far too narrow
@@ -44,9 +44,9 @@ def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> 
 
 
 def _verdict_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
-    truth = result.filters[filter_name].truth
-    if isinstance(truth, Unavailable):
-        return _not_evaluated(filter_name, "truth", truth)
+    truth_errors = result.filters[filter_name].truth
+    if isinstance(truth_errors, Unavailable):
+        return _not_evaluated(filter_name, "truth", truth_errors)
     errors = normalised_position_errors(result, filter_name)
     if isinstance(errors, Unavailable):
         return _not_evaluated(filter_name, "truth", errors)
@@ -85,5 +85,5 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     block_squares = cumulative_squares[ends] - cumulative_squares[starts]
     drawn = np.random.default_rng(0).integers(len(starts), size=(BOOTSTRAP_RESAMPLES, block_count))
     mean_squares = block_squares[drawn].sum(axis=1) / (ends - starts)[drawn].sum(axis=1)
-    low, high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
-    return float(low), float(high)
+    rms_low, rms_high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
+    return float(rms_low), float(rms_high)

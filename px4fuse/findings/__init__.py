@@ -35,7 +35,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, group_by_root
-from px4fuse.flight.model import Ekf2
+from px4fuse.flight.model import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
 
 __all__ = [
@@ -86,19 +86,21 @@ def find_loop(loop: Loop) -> tuple[Finding, ...]:
     return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
 
 
-def find_aids(results: Mapping[str, AidResult], ekf2: object = None) -> tuple[Finding, ...]:
+def find_aids(
+    aid_results: Mapping[str, AidResult], ekf2: Ekf2 | Unavailable | None = None
+) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
-    findings = list(aids.detect_in_aids(results))
+    findings = list(aids.detect_in_aids(aid_results))
     if isinstance(ekf2, Ekf2):
         span_s = ekf2.instances[0][0], ekf2.instances[-1][0]
         findings += ekf2_resets.detect_instance_switches(ekf2, span_s)
     return group_by_cause(findings)
 
 
-def finding_title(finding: str) -> str:
+def finding_title(finding_id: str) -> str:
     """Return the title of a finding, or its id with blanks if the id is unknown.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')
     """
-    return TITLES.get(finding, finding.replace("_", " "))
+    return TITLES.get(finding_id, finding_id.replace("_", " "))

@@ -66,7 +66,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Random innovations can set this flag for some seconds."
+    cause = "Normal measurement noise can cause this for some seconds."
     remedy = "If it lasts longer, check the IMU for vibration and clipping."
     if small_noise_parameters:
         cause = "EKF2's noise parameters of these sensors are too small."
@@ -91,8 +91,8 @@ def detect_in_aids(
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` EKF2's height
-    error in the longest gap of the barometer if it is larger than in the rest of the flight.
+    ``source_aid``: aiding source whose positions KF uses. ``take_off_s``: times (s) of take-offs.
+    ``height_error_m``: EKF2's largest height error in the longest barometer gap, if large.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -146,20 +146,20 @@ def detect_in_aids(
         elif aid.verdict == "overconfident" and name != source_aid:
             # no noise value is proposed: innovations alone do not distinguish noise from a wrong
             # delay
-            action = "Then correct the accuracy that the sensor reports."
+            action = "correct the accuracy that the sensor reports"
             if noise_parameter := AIDS[name].noise:
-                action = f"Then increase {noise_parameter}."
+                action = f"increase {noise_parameter}"
             noise_text = ""
             if aid.noise is not None:
                 noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
             yield warning(
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
-                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), "
-                f"and {format_percent(aid.rejected_fraction)} of the samples are rejected. The "
-                f"errors of this aiding source are larger than its √R{noise_text}, or another "
-                "aiding source is wrong.",
-                f"Check delay and mounting of the sensor first. {action}",
+                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1). "
+                f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
+                f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
+                "another sensor.",
+                f"Check delay and mounting of the sensor first. Then {action}.",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
@@ -177,7 +177,7 @@ def detect_in_aids(
                 f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
                 f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
                 "contradicts another one.",
-                "Calibrate the sensor. Noise settings do not correct a bias.",
+                "Calibrate the sensor. Changed noise settings do not correct a bias.",
                 {
                     "aid": name,
                     "axis": axis,

@@ -8,7 +8,7 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, group_by_root
 
-# Key in Finding.evidence: kind of cause, one of the constants below
+# Key in Finding.evidence for the kind of cause; its values follow (ELSEWHERE: none of the others)
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -20,7 +20,7 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes, if large
+# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes, if this is large
 WHITE_RATIO = "white_over_assumed"
 # Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"
@@ -32,11 +32,11 @@ GAP = "gap"
 GROUND = "never took off"
 # Key in Finding.evidence: wrong axes, unit, clock or orientation of the source
 CONVENTION = "convention"
-# Key in Finding.evidence: time (s) of a position jump with an increment of reset_counter
+# Key in Finding.evidence: time (s) of a position jump that the source announces by reset_counter
 ANNOUNCED = "reset_at_s"
-# Findings that explain other findings only as warning or error
+# Findings that explain other findings only if their severity is warning or error
 CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
-# Effects that keep their own action, because it also corrects their cause
+# Effects whose own action is shown: it corrects their cause as well
 ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
@@ -80,10 +80,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _with_action_of(cause: Finding, finding: Finding) -> Finding:
-    """Replace the action of an effect, which would hide its cause, by the action of the cause.
-
-    For example a larger measurement noise hides outliers.
-    """
+    """Give an effect the action of its cause; for example a larger noise only hides outliers."""
     if finding.caused_by is None or cause.severity == "note" or finding.id in ALTERNATIVE_FIXES:
         return finding
     return replace(finding, remedy=cause.remedy)
@@ -97,9 +94,9 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 def _report_rank(group: list[Finding]) -> int:
     cause = group[0]
     role = CATALOGUE[cause.id].role
-    is_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
-    if is_first and cause.severity != "note":
+    is_listed_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
+    if is_listed_first and cause.severity != "note":
         return -1
-    # a damaged recording falsifies noise estimates, so it is listed before wrong noises
-    ranks = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
-    return ranks.get(cause.severity, 4)
+    # warnings on the recording precede wrong noises (rank 2), whose estimates they falsify
+    rank_by_severity = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
+    return rank_by_severity.get(cause.severity, 4)

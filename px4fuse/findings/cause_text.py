@@ -62,7 +62,7 @@ def format_change(analysis: Analysis, cause: Trial) -> str:
 
 
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
-    """Format how much of ln(mean NIS or NEES) a change removes."""
+    """Format how much a change moves ln(mean NIS or NEES) towards 0, its value for a correct σ."""
     if makes_overconfident(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and is_sufficient(cause, statistic):

@@ -37,14 +37,15 @@ def detect(analysis: Analysis) -> Findings:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor} noise as outliers and relies on the IMU."
     else:
-        effect_text, gain = "", "large" if is_small else "small"
-        reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
+        effect_text, opposite = "", "large" if is_small else "small"
+        reason = f"EKF2's gain is therefore too {opposite}, and its reported σ too {direction}."
     title = f"{aid.noise} is {format_factor(factor)} times too {direction}{effect_text}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
-    if is_small and is_default:  # with PX4's default, name the sensor, not the parameter
-        assuming_filters = "KF and EKF2 assume" if has_kf_same_noise else "EKF2 assumes"
+    if is_small and is_default:  # PX4's default fits usual sensors, so the sensor is at fault
+        filters = "KF and EKF2" if has_kf_same_noise else "EKF2"
         title = (
-            f"{sensor} noise is {format_factor(factor)} times what {assuming_filters}{effect_text}"
+            f"{sensor} noise is {format_factor(factor)} times the noise setting of "
+            f"{filters}{effect_text}"
         )
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if (

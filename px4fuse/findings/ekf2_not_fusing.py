@@ -33,9 +33,9 @@ from px4fuse.flight.model import (
 
 # Fraction of the time with fusion of the source by EKF2, below which the severity is error
 MIN_FUSED_FRACTION_ERROR = 0.5
-# Fraction of the time with fusion of the source below which the severity is warning
+# Fraction of the time with fusion of the source by EKF2, below which the severity is warning
 MIN_FUSED_FRACTION_WARNING = 0.98
-# Minimum interval (s) between positions at which EKF2 may start fusion late because of jitter
+# Minimum interval (s) between positions at which jitter exceeds EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 # Minimum distance (m) of EKF2's invalid position from ground truth or source, for a finding
@@ -104,8 +104,8 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     else:
         yield warning(
             "ekf2_fusion_interrupted",
-            f"{message} EKF2 relied on its other sensors for up to "
-            f"{longest_s[1] - longest_s[0]:.1f} s.",
+            f"{message} For up to {longest_s[1] - longest_s[0]:.1f} s EKF2 relied on the IMU and "
+            "its other aiding sources.",
             action,
             evidence,
             spans,
@@ -133,7 +133,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
     distance_sentence = (
-        f" EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
+        f" In this time EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
     )
     if not np.isfinite(distance_m):
         distance_sentence = ""
@@ -150,7 +150,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return EKF2's largest horizontal distance (m) to ground truth, else to the source."""
+    """Return EKF2's largest horizontal distance (m) to ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     invalid_state = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
@@ -194,9 +194,9 @@ def _detect_slow_restart(
         longest_s = max(end - start for start, end in restart_delay_spans)
         yield note(
             "source_rate_at_limit",
-            f"{positions_phrase(source)} come at {source.rate_hz:.1f} Hz, so EKF2 "
-            f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
-            f"fusion only if two positions arrive within {EV_START_INTERVAL_S:g} s.",
+            f"After a gap EKF2 resumed fusion {longest_s:.1f} s late: {positions_phrase(source)} "
+            f"come at only {source.rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
+            f"positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
             {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
             tuple(restart_delay_spans),

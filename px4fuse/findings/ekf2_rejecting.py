@@ -22,7 +22,7 @@ from px4fuse.flight.model import Ekf2, Unavailable
 REJECTED_FRACTION_WARNING = 0.01
 # Minimum fraction of rejected samples for severity error
 REJECTED_FRACTION_ERROR = 0.20
-# Maximum ratio of the rejected fractions with and without a change that prevents rejections
+# A change prevents rejections if the rejected fraction with it ÷ without it is below this ratio
 MAX_REJECTED_RATIO = 0.5
 
 
@@ -33,7 +33,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate that would reject more than 1 % of the samples of a consistent filter."""
+    """Detect a gate so small that a consistent filter would lose 1 % of its samples."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
         # EKF2 accepts a sample if the innovations north and east are inside the gate: erf(gate/√2)²
@@ -48,14 +48,14 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
                 f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
                 f"gate rejects {format_percent(expected_fraction)} of the positions. Rejected "
                 "positions do not correct EKF2.",
-                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default).",
+                f"Set {aid.gate} to {aid.default_gate:g} √S (PX4's default).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected_fraction},
             )
 
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 rejects north and east together, so the main axis represents both
+    # EKF2 rejects the north and east innovation of a position together: the main axis is enough
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),

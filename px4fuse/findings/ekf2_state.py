@@ -40,7 +40,7 @@ MIN_GYRO_BIAS_RAD_S = 0.05
 GRAVITY_M_S2 = 9.80665
 # Minimum difference (m/s²) between gravity and the specific force at rest that a message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without tilt or yaw alignment for no finding
+# Maximum fraction of the flight without tilt or yaw alignment that is not reported
 MAX_UNALIGNED_FRACTION = 0.02
 
 
@@ -101,8 +101,8 @@ def _detect_limited_bias(
             if abs(force_m_s2 - GRAVITY_M_S2) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {GRAVITY_M_S2:.2f}: the bias is {GRAVITY_M_S2 - force_m_s2:+.2f} "
-                    "m/s² down."
+                    f"instead of {GRAVITY_M_S2:.2f}. Its bias along the down axis is "
+                    f"{GRAVITY_M_S2 - force_m_s2:+.2f} m/s²."
                 )
         yield error(
             "ekf2_bias_at_limit",
@@ -166,8 +166,8 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
         (
             "yaw_align",
             "heading",
-            f"{magnetometer_action}, or "
-            f"{'' if has_source_yaw else 'send the orientation of the source and '}let EKF2 fuse "
+            f"{magnetometer_action}. Alternatively, "
+            f"{'' if has_source_yaw else 'send the orientation of the source, and '}let EKF2 fuse "
             "the yaw of the source.",
         ),
     ):

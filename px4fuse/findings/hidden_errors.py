@@ -33,9 +33,9 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: the RMS position error is 4 reported σ
 MIN_NEES_ERROR = 16.0
-# Maximum ratio of the position RMSEs of KF and EKF2 if only EKF2 has a fault
+# Maximum position RMSE of KF ÷ that of EKF2 if only EKF2 has a fault
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum ratio of the position RMSEs after and before alignment for a misaligned frame
+# Maximum position RMSE after alignment ÷ before alignment if the frame is misaligned
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -60,8 +60,8 @@ class AlignedError(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"{format_metres(self.before_m)} m, and {format_metres(self.after_m)} m after the "
-            "best shift and rotation"
+            f"{format_metres(self.before_m)} m before and {format_metres(self.after_m)} m after "
+            "the best shift and rotation"
         )
 
     @property
@@ -72,7 +72,7 @@ class AlignedError(NamedTuple):
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
     """Find position errors larger than the reported σ that innovations do not show.
 
-    Return (filter, axis, error) for each of them, the largest mean NEES first.
+    Return (filter, axis, error) for each error, sorted by decreasing mean NEES.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
     # a position frame that was fitted to EKF2's track may contain EKF2's error
@@ -196,8 +196,8 @@ def _drift_finding(
             "" if aligned_error is None else f"Horizontal position RMSE {aligned_error}. "
         )
         drift_size = (
-            f"loop closure error {format_metres(closure_error_m)} m after a path of {length_m:.0f} "
-            f"m ({format_percent(closure_error_m / length_m, 1)})"
+            f"loop closure error {format_metres(closure_error_m)} m, "
+            f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
@@ -248,15 +248,15 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: its messages contain a heading, so it may be odometry. Innovations "
-        f"show how well a filter follows {sensor}, not the position error."
+        f"{sensor} may drift: odometry sends a heading as these messages do. Filters follow a "
+        "drifting source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
         noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
     ):
         bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise_m}
-        message += f" The position noise without drift is {bound_text}{noise_m:.2g} m."
+        message += f" The position noise (1 σ) is {bound_text}{noise_m:.2g} m, without the drift."
     if isinstance(loop, Loop) and (closure_error_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": closure_error_m, "path_length_m": loop.path_length_m}
         message += (

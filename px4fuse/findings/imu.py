@@ -29,11 +29,11 @@ MIN_IMU_RATE_HZ = 50.0
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
 MAX_CLIPPED_S = 0.1
-# Minimum time (s) between two clipped samples in different reported time spans
+# Time (s) without clipped samples that separates two reported time spans
 MIN_CLIPPING_PAUSE_S = 2.0
 # Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
 HIGH_RATE_BIT = 16
-# Minimum ratio of measured to needed sample rate: measured rates are up to 2 % below nominal
+# Minimum measured ÷ required sample rate: sensors are up to 2 % slower than their nominal rate
 MIN_RATE_RATIO = 0.98
 
 
@@ -136,8 +136,8 @@ def detect_clipping(analysis: Analysis) -> Findings:
     imu = analysis.flight.imu
     if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
         return
-    samples = cut_to_segment(imu, analysis.segment)
-    time_s = samples.index[samples["clipped"] > 0.0].to_numpy()
+    imu_samples = cut_to_segment(imu, analysis.segment)
+    time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
     total_s = len(time_s) / sample_rate(imu)
     if total_s > MAX_CLIPPED_S:
         clipping_bursts_s = np.split(
@@ -170,8 +170,8 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
             action = "Use a faster SD card. "
         yield warning(
             "imu_gap",
-            f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases Q to "
-            "the variance of the measured acceleration.",
+            f"{missing_data} samples are missing for {gap_s:.2f} s. In this gap KF increases "
+            "SIGMA_A to the standard deviation of the measured acceleration.",
             f"{action}Analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             spans,
@@ -190,7 +190,10 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     action = "Use a faster SD card."
     if other_topics := profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
-        action = f"Use a faster SD card, or set SDLOG_PROFILE to {profile ^ other_topics}."
+        action = (
+            "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
+            f"{profile ^ other_topics}."
+        )
     yield warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "

@@ -1,4 +1,4 @@
-"""False loop closures, too small stated odometry drift, and landing assumed at take-off place."""
+"""Detect false loop closures, a stated odometry drift that is too small, and wrong assumptions."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -59,16 +59,16 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
     if loop.is_absolute_track:
         yield warning(
             "loop_on_absolute_positions",
-            "This track follows an absolute positioning system and does not drift. The loop "
-            "closure error is the noise of one position, so a correction makes the path worse.",
+            "This track consists of absolute positions, which do not drift. The loop closure error "
+            "is only position noise, so a correction makes the path worse.",
             "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
         yield note(
             "loop_landing_assumed",
-            "The landing place is unknown, so px4fuse assumes the take-off place. The true "
-            "distance between both places appears as loop closure error.",
+            "The landing place is unknown, so px4fuse assumes the take-off place. If the vehicle "
+            "landed elsewhere, the loop closure error contains the distance between both places.",
             "Measure the landing place and state it: --landed-at FORWARD,RIGHT (m, along and to "
             "the right of the nose at take-off).",
             evidence,
@@ -83,7 +83,7 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
             f"False loop closure of {closure.distance_m:.2f} m: the landing place is not the "
             "take-off place"
         )
-    action = "Remove this loop closure; px4fuse ignores it."
+    action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:
         action = (
             "If the vehicle landed elsewhere, state the place (--landed-at FORWARD,RIGHT) or "
@@ -91,11 +91,11 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
         )
     return error(
         "false_loop_closure",
-        f"{fault}. The stated drift does not explain the closure error (squared Mahalanobis "
-        f"distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, p "
-        f"{closure.p:.1g}). Enforcing the closure would deform the whole path.",
-        f"{action} If the odometry does drift this much, increase the stated drift (--drift, "
-        "--heading-drift).",
+        f"{fault}. The stated drift of the odometry does not explain the closure error (squared "
+        f"Mahalanobis distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, "
+        f"p {closure.p:.1g}). A path that contains this closure would be deformed.",
+        f"{action} If the odometry has more drift than stated, increase --drift and "
+        "--heading-drift.",
         _closure_evidence(closure),
     )
 

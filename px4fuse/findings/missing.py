@@ -51,7 +51,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     if source.origin.has_all_samples or has_received_positions:
         return
     rate_hz, parameters = source.rate_hz, analysis.flight.log.parameters
-    profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
+    sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     reasons = (
         missing_data.reason
         for missing_data in analysis.missing
@@ -62,6 +62,6 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{RECEIVED_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
-        f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} (bit 7) and fly again.",
-        {"rate_hz": rate_hz, "sdlog_profile": profile},
+        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7) and fly again.",
+        {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
     )

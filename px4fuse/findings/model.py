@@ -24,12 +24,13 @@ class CatalogueEntry(Record):
     group : str
         One of :data:`GROUPS`.
     role : str
-        "unusable": the source makes all estimates invalid; "misleading": some samples do. These and
-        "first" are listed first, "noise" after other errors, "recording" before other warnings.
+        "unusable": all positions of the source make estimates invalid; "misleading": some positions
+        do. Both and "first" are listed first, "noise" after other errors, "recording" before other
+        warnings.
     verdict : str
-        "meaningless": the verdicts on the filters are meaningless, so the card shows this cause
-        first. "repeated": the finding only repeats a verdict, so the card shows it only without
-        another cause.
+        Relation to the verdicts on σ. "meaningless": they are invalid, and the card shows this
+        cause first. "repeated": the finding is the same statement as a verdict; the card shows it
+        only if there is no other cause.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
@@ -152,14 +153,14 @@ def format_percent(fraction: float, digits: int = 0) -> str:
 
 def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
     """Return the time spans of a segment in which a step function has a value."""
-    edges_s = np.clip(
+    step_times_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
     )
-    edges_s[0] = segment.start_s
-    is_inside = np.diff(edges_s) > 0.0
+    step_times_s[0] = segment.start_s
+    is_inside = np.diff(step_times_s) > 0.0
     has_value = np.concatenate([[False], step_function.to_numpy()[is_inside] == value, [False]])
-    edges_s = np.append(edges_s[:-1][is_inside], segment.end_s)
-    changes_s = edges_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
+    step_times_s = np.append(step_times_s[:-1][is_inside], segment.end_s)
+    changes_s = step_times_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
     return tuple(zip(changes_s[::2], changes_s[1::2], strict=True))
 
 

@@ -49,18 +49,19 @@ from px4fuse.request import COMPARISON_OPTIONS
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
 MIN_NOISE_FACTOR_ERROR = 4.0
-# Minimum time constant (s) of a KF whose Q is almost zero: vehicles turn faster
+# A KF with a larger time constant (s) ignores new positions: vehicles turn faster
 MIN_TIME_CONSTANT_S = 2.5
-# Factor on the 95 % interval of a noise estimate (log scale): 0.3 % of correct settings are outside
+# Factor on the width of the 95 % interval of ln(noise estimate): 0.3 % of correct settings are
+# outside
 INTERVAL_WIDENING = 1.5
 # Minimum lag-1 autocorrelation of the innovations of a KF that lags; white innovations reach 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
 MIN_SIGMA_FACTOR_ERROR = 2.0
-# Maximum ratio of equal noises: two standard errors of a median of 100 values
+# Two noises are equal up to this ratio: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# Minimum ratio of EKF2's √R to EKF2_EVP_NOISE if EKF2 takes R from the position messages
+# EKF2 takes R from the position messages if √R ÷ EKF2_EVP_NOISE is above this ratio
 MIN_REPORTED_NOISE_RATIO = 1.25
 # Action if no re-run explains the wrong σ
 UNEXPLAINED_SIGMA = (
@@ -68,7 +69,7 @@ UNEXPLAINED_SIGMA = (
     "IMU (rate, gaps, vibration)."
 )
 UNKNOWN_NOISE = "The noise could not be estimated; px4fuse tune LOG states the reason."
-NO_IMPROVEMENT = "No change: a re-run with the estimate improves neither position nor σ."
+NO_IMPROVEMENT = "No change: a re-run with the estimated noise improves neither position nor σ."
 
 
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
@@ -78,7 +79,7 @@ KEEP_NOISES_CORRELATED = (
     "innovations do not show."
 )
 KEEP_NOISES_TRUTH = (
-    "Do not reduce noise settings: σ would become smaller than the errors against ground truth."
+    "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
 # Effect of a wrong noise setting on KF, and its reason
 SETTING_EFFECTS = {
@@ -152,12 +153,13 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
 def _setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
 ) -> Finding:
-    estimate, factor, severity = deviation
+    estimated_noise, factor, severity = deviation
     setting = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
-    direction, is_upper_bound = "small" if setting < estimate else "large", noise.value is None
+    direction = "small" if setting < estimated_noise else "large"
+    is_upper_bound = noise.value is None
     effect, reason = SETTING_EFFECTS[name, direction]
-    action = format_setting_action(analysis, name, estimate)
+    action = format_setting_action(analysis, name, estimated_noise)
     return finding(
         "note" if action == NO_IMPROVEMENT else severity,
         f"{name[:7]}_too_{direction}",
@@ -166,8 +168,8 @@ def _setting_finding(
         action,
         {
             "chosen": setting,
-            "most_likely": estimate,
-            "factor": setting / estimate,
+            "most_likely": estimated_noise,
+            "factor": setting / estimated_noise,
             "lag1_autocorrelation": getattr(
                 axis_tuning.before, "lag1_autocorrelation", float("nan")
             ),
@@ -232,7 +234,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
         axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
-        title, estimate_text = f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero", ""
+        title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a:g} m/s²)", ""
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (ml_sigma_a := axis_tuning.sigma_a_two_state.value):
             title = f"SIGMA_A is {format_factor(ml_sigma_a / sigma_a)} times too small"
@@ -240,8 +242,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"{title}: KF ignores new positions. {estimate_text}The gain falls to "
-            f"{settled_gain:.2g}. KF needs {time_constant_s:.0f} s to follow a position change.",
+            f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
+            f"{settled_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position change.",
             action,
             {"gain": settled_gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
@@ -317,8 +319,8 @@ def _variance_finding(
         f"{filter_name}_{confidence}",
         f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
         f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
-        f"mean NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} "
-        f"({axis_group} axes).",
+        f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
+        f"{low:.2f} to {high:.2f}.",
         remedy_text,
         {
             "axis": result.axis.name,
@@ -345,8 +347,8 @@ def _format_excessive_noise(analysis: Analysis) -> str:
         return ""
     noise_origin = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
     return (
-        f"{name} is {parameter_m:g} m, but {noise_origin} {noise_m:.2g} m: test the second value "
-        "with px4fuse whatif."
+        f"{name} is {parameter_m:g} m, but {noise_origin} {noise_m:.2g} m. Test this noise by a "
+        "replay: px4fuse whatif LOG."
     )
 
 
@@ -357,15 +359,15 @@ def _format_noise_minimum(analysis: Analysis) -> str:
     if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
         return ""
     return (
-        "No change: while EKF2 fuses GNSS, EKF2's noise of vision positions is at least "
-        f"{GNSS_POS.noise} ({gnss_m:g} m)."
+        "No change: while EKF2 fuses GNSS as well, PX4 limits the noise of vision positions to at "
+        f"least {GNSS_POS.noise} ({gnss_m:g} m)."
     )
 
 
 def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
-    """Return True if the filter uses the default noises of px4fuse (KF) or PX4 (EKF2)."""
+    """Return True if a filter uses px4fuse's default noises (KF) or PX4's default R (EKF2)."""
     if filter_name == "kf":
         settings, defaults = analysis.settings, Settings()
         return all(
@@ -429,8 +431,8 @@ def _variance_remedy_without_replay(
             "this change: fly again and compare."
         )
     return (
-        f"EKF2's measurement noise ({ekf2_sigma_m:.2g} m) fits the position noise, so another "
-        "error makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, "
+        f"EKF2's measurement noise ({ekf2_sigma_m:.2g} m) equals the estimated position noise, so "
+        "another fault makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, "
         "vibration)."
     )
 

@@ -14,12 +14,12 @@ from px4fuse.findings.model import Findings, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# Minimum ratio of σ ratios, or of position RMSEs, before and after a change for a warning
+# Minimum factor by which σ ratio or position RMSE differ before and after a change, for a warning
 MIN_CHANGE_RATIO = 1.5
 
 
 class PartConsistency(NamedTuple):
-    """EKF2 in one part of the flight; values are NaN and texts empty if unknown."""
+    """Consistency and position RMSE of EKF2 in one part of the flight; NaN or "" if unknown."""
 
     verdict: str
     sigma_ratio: float
@@ -82,7 +82,6 @@ def _differ_significantly(before: float, after: float) -> bool:
 
 
 def _assess_part(analysis: Analysis, start_s: float, end_s: float) -> PartConsistency:
-    """Describe EKF2 in a time span."""
     unknown, rmse_m = float("nan"), float("nan")
     errors = position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):

@@ -67,12 +67,15 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
     for topic, count in list(log.dropped.items())[:1]:
         other_count = len(log.dropped) - 1
-        other_topics = f" Other topics with such samples: {other_count}." if other_count else ""
+        topics = "topic" if other_count == 1 else "topics"
+        other_topics = (
+            f" {other_count} other {topics} also have such errors." if other_count else ""
+        )
         yield note(
             "samples_out_of_order",
-            f"{count} samples of {topic} have wrong timestamps. The timestamps are zero or go "
-            f"back, so px4fuse ignores these samples.{other_topics} Possible cause: a clock was "
-            "set back, or messages arrived in another order.",
+            f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
+            f"before. px4fuse ignores these samples.{other_topics} Possible cause: a clock was set "
+            "back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": other_count + 1},
         )
@@ -92,9 +95,9 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
     if reversals := log.receive_time_reversals:
         yield note(
             "receive_time_went_back",
-            f"The receive time went back {format_count(reversals)}. Possible cause: the recording "
-            "computer's clock was set, or recordings were joined. Timestamps in the messages are "
-            "not affected.",
+            f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
+            "clock of the recording computer was set back, or the file consists of several "
+            "recordings. Timestamps in the messages are not affected.",
             "Switch off time synchronisation of the recording computer while recording.",
             {"count": reversals},
         )
@@ -106,7 +109,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if MODEL_NOTE in log.notes:
         yield note(
             "ekf2_simulated",
-            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code.",
+            "This log is simulated: px4fuse's own model of EKF2 computed the EKF2 estimates, not "
+            "PX4's code.",
             "Use a real flight to assess PX4's EKF2.",
         )
     if not isinstance(ekf2, Ekf2):
@@ -116,14 +120,14 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
             "not_px4",
             f"This log is from {log.autopilot}, not PX4. {log.autopilot} does not have the PX4 "
             "parameters that the report names.",
-            'Read "EKF2" in this report as the estimator of this autopilot.',
+            f'In this report, "EKF2" means the estimator of {log.autopilot}.',
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):
-        variances = " and variances" if isinstance(ekf2.variance, pd.DataFrame) else ""
+        contents = "states and variances" if isinstance(ekf2.variance, pd.DataFrame) else "states"
         yield note(
             "innovations_need_ulog",
-            f"A MAVLink recording contains EKF2's states{variances}, but no innovations. The "
+            f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
             "Give the ULog of this flight as argument LOG."
             if log.has_ulog

@@ -16,7 +16,7 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# Maximum ratio of KF's position RMSEs with and without the correction of a reported time offset
+# Maximum position RMSE of KF with ÷ without correction of a time offset, if the offset is reported
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
@@ -43,8 +43,9 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         yield error(
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
-            f"{end_offset_s:+.2f} s (p {clock.change_p_value:.1g}). No single --clock-offset "
-            "corrects both. PX4 uses arrival times until it has received 500 TIMESYNC answers.",
+            f"{end_offset_s:+.2f} s (significance test: p {clock.change_p_value:.1g}). No single "
+            "--clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
+            "TIMESYNC answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
             "before or after the change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},
@@ -69,7 +70,8 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         f"Position timestamps are {offset_size_s:.2f} s {'late' if is_late else 'early'}. The "
         f"estimate from IMU and positions is {offset_size_s:.3f} s (95 % {lower_s:.3f} to "
         f"{upper_s:.3f} s). At 1 m/s this is a position error of {offset_size_s:.2f} m in KF and "
-        f"EKF2, which innovations hardly show.{_assumed_delay_sentence(analysis, clock)}",
+        "EKF2. Innovations hardly show this "
+        f"error.{_assumed_delay_sentence(analysis, clock)}",
         _offset_remedy(analysis, clock),
         evidence,
     )
@@ -120,12 +122,12 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
         f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
     )
     shift_text = format_shift(clock.remaining_s)
-    return f"{shift_text} the timestamp (usec) of each position{delay_action}."
+    return f"{shift_text} the timestamp of each position{delay_action}."
 
 
 def clock_offset_option_s(comparison: PreparedComparison, clock: ClockOffset) -> float:
     """Return the value (s) for ``--clock-offset``."""
-    # the option replaces the time offset that the alignment of a position file applied
+    # --clock-offset replaces the time offset that the alignment of a position file applied
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
@@ -158,7 +160,7 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
         f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
         "so its track leads or "
-        f"lags.{f' EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
+        f"lags.{f' The parameter EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
         CORRECT_AT_SENDER if limit_text else _delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
     )

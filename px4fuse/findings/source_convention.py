@@ -33,7 +33,7 @@ ConventionFault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    convention, faults = analysis.convention, _faults(analysis)
+    convention, faults = analysis.convention, _convention_faults(analysis)
     if convention is None:
         return
     for name, kind, message, action in (
@@ -49,8 +49,11 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
-    """Remove the findings that are only effects of a wrong convention, except those about EKF2."""
-    faults = _faults(analysis)
+    """Remove the findings that are only effects of wrong axes, unit, clock or orientation.
+
+    Those on EKF2 remain, because EKF2 used the positions as sent, and px4fuse corrects them.
+    """
+    faults = _convention_faults(analysis)
     root_findings = [item for item in findings if CONVENTION in item.evidence]
     unusable_findings = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
     if unusable_findings:
@@ -98,7 +101,7 @@ def _is_effect(item: Finding) -> bool:
     return CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
-def _faults(analysis: Comparison) -> Faults:
+def _convention_faults(analysis: Comparison) -> Faults:
     return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
@@ -109,8 +112,8 @@ def _position_faults(
     is_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     basis_text = (
-        "The motion measured by the IMU fits this convention best (log likelihood ratio to the "
-        f"next best convention {'above ' if log_odds == 99.0 else ''}{log_odds:.0f})."
+        "Of all tested axes, units and time offsets, these fit the IMU best (log likelihood ratio "
+        f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
     axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
@@ -121,7 +124,7 @@ def _position_faults(
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
             usage_text = (
-                "EKF2's heading came from this source, so the direction of north is unknown."
+                "EKF2 took its heading from this source, so nothing shows the direction of north."
             )
         fault, action = describe_axes(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
@@ -137,8 +140,8 @@ def _position_faults(
         )
         message = (
             f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source is not north, or this heading "
-            f"is wrong. {basis_text} The analysis uses the positions rotated to NED."
+            f"relative to {heading_text}. The x axis of the source does not point north, or "
+            f"{heading_text} is wrong. {basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -158,9 +161,9 @@ def _position_faults(
     late_s, drift_percent = convention.late_s, 100.0 * faults.clock_drift
     if drift_percent:
         message = (
-            f"The clock of the position timestamps is {abs(drift_percent):.1f} % "
-            f"{'fast' if drift_percent > 0 else 'slow'}, and the timestamps are {late_s:+.2f} s "
-            f"late in the middle of the flight. {basis_text} The analysis uses corrected "
+            f"The clock of the position timestamps is {abs(drift_percent):.1f} % too "
+            f"{'fast' if drift_percent > 0 else 'slow'}. In the middle of the flight the "
+            f"timestamps are {late_s:+.2f} s late. {basis_text} The analysis uses corrected "
             "timestamps."
         )
         action = (
@@ -183,9 +186,9 @@ def _position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions} are not NED and not determined by the motion: "
-            f"{'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates nothing "
-            "from the positions."
+            f"The axes of the {positions} are not NED, and the motion does not show which they "
+            f"are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates "
+            "nothing from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -203,7 +206,8 @@ def _orientation_faults(
             "px4fuse ignores it."
         )
         action = (
-            "Send no orientation (q NaN), and fuse the position only (EKF2_EV_CTRL without bit 3)."
+            "Send no orientation (quaternion of NaN), and let EKF2 fuse the position only "
+            "(EKF2_EV_CTRL without bit 3)."
         )
         yield "source_orientation_copied", "copied", message, action
         return
@@ -213,14 +217,14 @@ def _orientation_faults(
     )
     fault, action = {
         "order": (
-            f"The quaternion of {source} is sent in the order x, y, z, w; PX4 reads w, x, y, z. In "
-            f"the order x, y, z, w {agreement_text}",
+            f"The quaternion of {source} is sent in the order x, y, z, w, but PX4 reads w, x, y, "
+            f"z. After a correction of the order, {agreement_text}",
             "Write w first (px4_msgs: q[0] is w). Eigen coeffs(), SciPy as_quat() and "
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {source} is {orientation.frames}; PX4 reads FRD to NED. As "
-            f"{orientation.frames}, {agreement_text}",
+            f"The orientation of {source} rotates {orientation.frames}, but PX4 expects FRD to "
+            f"NED. After a conversion of the frames, {agreement_text}",
             describe_conversion(orientation.frames),
         ),
         "heading": (
@@ -231,6 +235,6 @@ def _orientation_faults(
             "heading, which is zero at east.",
         ),
     }[faults.orientation]
-    message = f"{fault}. A filter that fuses this yaw gets a wrong heading."
+    message = f"{fault}. If EKF2 fuses the yaw of this orientation, EKF2's heading becomes wrong."
     action += " Until then do not fuse the yaw (EKF2_EV_CTRL bit 3)."
     yield "source_orientation_wrong", faults.orientation, message, action

@@ -6,6 +6,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.core.text import lower_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
@@ -22,8 +23,8 @@ MIN_HEADING_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of EKF2's heading drift against ground truth to its drift against the positions;
-# below, the positions drift, not EKF2
+# EKF2's heading drifts only if its drift against ground truth ÷ that against the positions is above
+# this ratio; otherwise the positions drift
 MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -48,14 +49,14 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
     sensor = source_name(analysis.source)
     fault = (
-        f"{positions_phrase(analysis.source)} are in FRD: their x axis is the "
-        "heading at start, not north."
+        f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
+        "along the heading at the start, not north."
     )
     fusion_sentence, action = "", f"In this report, north is the x axis of {sensor}."
     if isinstance(fusion_flags, Unavailable):
         fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor}."
         if log.has_ulog:
-            action += " Give the ULog, too: it shows the frame that EKF2 uses."
+            action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
         and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
@@ -66,8 +67,8 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
     return warning(
         "source_frame_frd",
-        f"{fault} EKF2 did not fuse the yaw of {sensor}. The IMU is rotated into NED, so the axes "
-        "of positions and IMU may differ.",
+        f"{fault} EKF2 did not fuse the yaw of {sensor}, so EKF2's axes are NED. The axes of "
+        "positions and EKF2 may differ.",
         "Send the position in NED"
         + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
     )
@@ -96,7 +97,10 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         reason = "GNSS positions refer to true north, so the heading is wrong."
         _, action = _gnss_heading_fault(analysis)
     elif analysis.source.name == ALIGNED_TOPIC:
-        reason = "EKF2 fused the positions in this frame. The IMU measures another direction."
+        reason = (
+            "EKF2 fused the positions in this frame, but the IMU measures another direction of "
+            "motion."
+        )
         action = "Align the positioning frame with north."
     else:
         finding_id, reference = "source_frame_misaligned", "the IMU"
@@ -107,7 +111,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
     if not analysis.source.origin.is_gnss and (calibration_advice := _calibration_advice(analysis)):
-        action += f" Or: {calibration_advice}"
+        action += f" Alternatively: {lower_first(calibration_advice)}"
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
@@ -122,8 +126,11 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
 def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (trial := confirmed_noise_trial(analysis)) is not None:
-        cause = f"the wrong {aid_of(analysis).noise}, which weights GNSS against the magnetometer"
-        return cause, f"Set {format_settings(trial.change)}, then check the heading again."
+        cause = (
+            f"the wrong {aid_of(analysis).noise}: it determines the influence of GNSS on EKF2's "
+            "heading"
+        )
+        return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
     cause = "a magnetometer near currents or steel"
     return cause, f"{_calibration_advice(analysis)} {CHECK_GNSS_DELAY}".lstrip()
 
@@ -171,7 +178,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     ]
     possible_cause, action = ", or ".join(possible_causes), ""
     is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL_BIT
-    let_text = "Or let" if calibration_advice else "Let"
+    let_text = "Alternatively, let" if calibration_advice else "Let"
     if has_yaw and not is_yaw_fused:
         action = f"{let_text} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:

@@ -25,8 +25,8 @@ MIN_LOST_FRACTION = 0.02
 MIN_INTERVALS = 50
 # Minimum fraction of missing positions for downsampling: a radio link loses less
 MIN_DOWNSAMPLED_FRACTION = 0.25
-# Minimum fraction of the two commonest intervals: downsampling from 30 Hz to 20 Hz alternates
-# between 1 and 2 periods, lost messages do not
+# Minimum fraction of intervals that are n or n + 1 periods of the source, with the commonest n.
+# Downsampling from 30 Hz to 20 Hz alternates between 1 and 2 periods; lost messages do not
 MIN_MULTIPLE_PAIR_FRACTION = 0.85
 # Minimum fraction of the rarer one of the two intervals of a downsampled source
 MIN_RARER_MULTIPLE_FRACTION = 0.1
@@ -96,11 +96,12 @@ def _remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: fl
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
-    log_text = "Use a faster SD card, or log" if analysis.flight.log.dropouts else "Log"
-    return f"{log_text} fewer topics (SDLOG_PROFILE)."
+    if analysis.flight.log.dropouts:
+        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+    return "Log fewer topics (SDLOG_PROFILE)."
 
 
-def _partial_source_finding(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
+def _partial_source_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
     is_stop = end_s == analysis.segment.flight.end_s
     event_verb, event_s, before_or_after = (
@@ -120,13 +121,13 @@ def _partial_source_finding(analysis: Analysis, span_s: Span, aids: list[Aid]) -
         )
     has_aids, aiding_sentence = _has_aids(analysis.flight.ekf2), ""
     if has_aids:
-        aid_labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
-        aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {aid_labels}. "
+        labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
+        aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}. "
     return finding(
-        "error" if has_aids and not aids and duration_s > MAX_NOT_FUSED_S else "warning",
+        "error" if has_aids and not fused_aids and duration_s > MAX_NOT_FUSED_S else "warning",
         "source_stops" if is_stop else "source_begins",
         f"{positions_phrase(source)} {event_verb} in flight at {event_s:.1f} s{effect_text}. "
-        f"{aiding_sentence}KF, RMSE and verdicts do not include this time.",
+        f"{aiding_sentence}px4fuse evaluates KF and EKF2 only while positions arrive.",
         f"Check {source_words(source).reception} {before_or_after} {event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_at_end},
         (span_s,),
@@ -134,7 +135,10 @@ def _partial_source_finding(analysis: Analysis, span_s: Span, aids: list[Aid]) -
 
 
 def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's horizontal error and reported σ (m) at the end of a time span, if known."""
+    """Return EKF2's horizontal error against ground truth and reported σ (m) at the end of a span.
+
+    Unknown values are missing.
+    """
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squares_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
@@ -160,7 +164,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, (start_s, end_s) = analysis.main, gap_s
     before_end_s = np.array([start_s, end_s - BEFORE_UPDATE_S])
-    axis, ekf2 = result.axis, result.ekf2_state
+    axis, ekf2_state = result.axis, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance to the first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
@@ -171,7 +175,9 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
         )
     error_texts = []
     aiding_sentence = "KF relies on the IMU alone."
-    if isinstance(ekf2, pd.DataFrame) and len(positions_before := ekf2["position_m"].loc[:end_s]):
+    if isinstance(ekf2_state, pd.DataFrame) and len(
+        positions_before := ekf2_state["position_m"].loc[:end_s]
+    ):
         if _has_aids(analysis.flight.ekf2):
             aiding_sentence = "KF and EKF2 rely on the IMU alone."
         if other_aids := _continuously_fused_aids(analysis.flight.ekf2, gap_s):
@@ -237,17 +243,17 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # mapped timestamps and a logger with a lower rate do not show the intervals of received
-    # positions
+    # the intervals of received positions are unknown if px4fuse changed the timestamps, or if PX4
+    # logs the positions only after EKF2 used them (ALIGNED)
     if source.clock_map is not None or source.origin.preference_rank >= ALIGNED.preference_rank:
         return
     intervals_s, _ = _position_intervals_s(analysis)
-    period_and_multiples = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None
-    if period_and_multiples is None:
+    period_and_counts = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None
+    if period_and_counts is None:
         return
-    period_s, multiples = period_and_multiples
-    lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
-    fractions = np.bincount(multiples.astype(np.intp)) / len(multiples)
+    period_s, period_counts = period_and_counts
+    lost_fraction = 1.0 - 1.0 / float(np.mean(period_counts))
+    fractions = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
     pair_fractions = fractions[:-1] + fractions[1:]
     first_multiple = int(np.argmax(pair_fractions))
     is_alternating = (
@@ -265,8 +271,8 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     )
     if is_too_slow:
         message += (
-            " EKF2 (v1.14 and later) starts fusion only if two positions come within "
-            f"{EV_START_INTERVAL_S:g} s."
+            " EKF2 (v1.14 and later) cannot start fusion at this rate: two positions must arrive "
+            f"within {EV_START_INTERVAL_S:g} s."
         )
     yield finding(
         "error" if is_too_slow else "warning",
@@ -294,14 +300,14 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
     # the upper median is a measured interval, not a mean of two
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
-    for period_count in range(1, MAX_PERIOD_COUNT + 1):
-        multiples = np.rint(intervals_s * period_count / median_interval_s)
-        if np.any(multiples < 1.0):
+    for median_count in range(1, MAX_PERIOD_COUNT + 1):
+        period_counts = np.rint(intervals_s * median_count / median_interval_s)
+        if np.any(period_counts < 1.0):
             continue
-        period_s = float(np.sum(intervals_s) / np.sum(multiples))
+        period_s = float(np.sum(intervals_s) / np.sum(period_counts))
         if (
-            float(np.sqrt(np.mean((intervals_s / period_s - multiples) ** 2)))
+            float(np.sqrt(np.mean((intervals_s / period_s - period_counts) ** 2)))
             <= MAX_MULTIPLE_RMS_ERROR
         ):
-            return period_s, multiples
+            return period_s, period_counts
     return None

@@ -19,7 +19,7 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# Minimum ratio of white to time-correlated noise if the white noise is a separate fault
+# Minimum white ÷ time-correlated noise from which white noise is treated as a separate fault
 MIN_WHITE_NOISE_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
 # a fault exceeds it
@@ -32,11 +32,11 @@ MIN_REPEAT_FRACTION_ERROR = 0.3
 MIN_REPEATS = 10
 # Minimum ratio of the position noises (σ) along north and east for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
-# Minimum ratio of the position noises in one part of the flight and in the rest, for a warning
+# Minimum noise in one part of the flight ÷ noise in the rest, for a warning
 MIN_PART_NOISE_RATIO = 2.0
-# Minimum ratio of the noises in one part of the flight and in the rest, without outliers
+# The same minimum after removal of the outliers, for a warning
 MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the noises in one part of the flight and in the rest, for severity error
+# Minimum noise in one part of the flight ÷ noise in the rest, for severity error
 MIN_PART_NOISE_RATIO_ERROR = 4.0
 
 
@@ -74,14 +74,14 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         and noise.white_m > MIN_WHITE_NOISE_RATIO * noise.slow_m
     ):
         evidence[WHITE_RATIO] = white_noise_ratio
-    # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
+    # time-correlated errors are normal for GNSS, so those within the reported σ are only a note
     make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
-        f"{correlation_time_text} ({interval_text}). It adds to white noise of {noise.white_m:.2g} "
-        "m (1 σ). KF and EKF2 assume independent errors: they follow the correlated error and "
-        "report a σ that is too small. Innovations do not show this error.",
+        f"{correlation_time_text} ({interval_text}). In addition the source has white noise of "
+        f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors. Both follow the "
+        "correlated error and report a σ that is too small. Innovations do not show this error.",
         f"Check {source_words(analysis.source).errors}.",
         evidence,
     )
@@ -136,17 +136,17 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     )
     if len(noises_m) < 2:
         return
-    (smaller_m, _, smaller_high_m, quiet_axis), (larger_m, larger_low_m, _, noisy_axis) = noises_m
-    if larger_m < MIN_AXIS_NOISE_RATIO * smaller_m or larger_low_m <= smaller_high_m:
+    (quiet_m, _, quiet_high_m, quiet_axis), (noisy_m, noisy_low_m, _, noisy_axis) = noises_m
+    if noisy_m < MIN_AXIS_NOISE_RATIO * quiet_m or noisy_low_m <= quiet_high_m:
         return
     yield warning(
         "source_noise_unequal_axes",
-        f"{source_name(analysis.source)} noise is {larger_m:.2g} m along "
-        f"{noisy_axis} and {smaller_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
+        f"{source_name(analysis.source)} noise is {noisy_m:.2g} m along "
+        f"{noisy_axis} and {quiet_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
         "measurement noise, does not fit both axes.",
         f"Check {source_words(analysis.source).errors}. Analyse each axis separately "
-        f"(--axis {noisy_axis} --sigma-z {larger_m:.2g}).",
-        {f"{quiet_axis}_sigma_z_m": smaller_m, f"{noisy_axis}_sigma_z_m": larger_m},
+        f"(--axis {noisy_axis} --sigma-z {noisy_m:.2g}).",
+        {f"{quiet_axis}_sigma_z_m": quiet_m, f"{noisy_axis}_sigma_z_m": noisy_m},
     )
 
 

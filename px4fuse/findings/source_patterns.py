@@ -74,12 +74,12 @@ def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
             "source_noise_grows_with_speed",
             f"{source_name(analysis.source)} noise grows with speed: "
             f"{format_metres(noise.slow_m)} m at {noise.slow_m_s:.1f} m/s and "
-            f"{format_metres(noise.fast_m)} m at {noise.fast_m_s:.1f} m/s (1 σ). It grows along "
-            "and across the motion, so time offset and jitter are not the cause. No single "
+            f"{format_metres(noise.fast_m)} m at {noise.fast_m_s:.1f} m/s (1 σ). The noise grows "
+            "along and across the motion, so time offset and jitter are not the cause. No single "
             "measurement noise fits the whole flight.",
-            "Let the source send a variance with each position that grows with speed "
-            "(EKF2_EV_NOISE_MD 0). Check motion blur, exposure and the ranging time of one "
-            "position.",
+            "Let the source send a variance that grows with speed (EKF2_EV_NOISE_MD 0). For "
+            "cameras, check motion blur and exposure; for UWB, check the time that the ranges of "
+            "one position take.",
             noise._asdict(),
         )
 
@@ -92,9 +92,9 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
             f"The error of the {positions} is periodic: amplitude "
             f"{format_metres(periodic.amplitude_m)} m, period {periodic.period_s:.1f} s. This "
             f"sinusoid explains {format_percent(min(periodic.fraction, 1.0))} of the slow errors "
-            "against ground truth. KF and EKF2 follow it, and innovations hardly show it.",
+            "against ground truth. KF and EKF2 follow this error, so innovations hardly show it.",
             f"Check {source_words(analysis.source).errors}. Look for a process with this period, "
-            "such as a rotating part or a control loop. No noise setting corrects it.",
+            "such as a rotating part or a control loop. No noise setting corrects this error.",
             periodic._asdict(),
         )
         return
@@ -105,12 +105,12 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
         yield error(
             "source_time_offset_changes",
             f"The time offset of the {positions} varies in flight by "
-            f"{variation.most_s - variation.least_s:.2f} s. Relative to the mean it is "
+            f"{variation.most_s - variation.least_s:.2f} s. Its deviation from the mean is "
             f"{variation.least_s:+.2f} s at {variation.least_at_s:.0f} s and "
             f"{variation.most_s:+.2f} s at {variation.most_at_s:.0f} s, estimated from the errors "
             "along the motion against ground truth. No single --clock-offset corrects this.",
-            "Synchronise the clocks throughout the flight, and send the time of measurement "
-            "instead of the time at which a position was sent or received.",
+            "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
+            "time at which a position was sent or received.",
             variation._asdict(),
         )
 

@@ -50,10 +50,10 @@ MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; without a low pass the
 # ratio is 0 to 2
 MIN_LOW_PASS_GAIN_NATS = 6.0
-# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise
+# Minimum log likelihood ratio (nats) of noise after a low pass to time-correlated noise without lag
 MIN_LAG_NATS = 1.0
-# Maximum ratio of the lag of a low pass to the largest delay in the 95 % interval; a larger lag
-# is replaced by the delay
+# Maximum lag of a low pass ÷ upper end of the 95 % interval of the delay; above this ratio the
+# estimated delay is used as lag
 MAX_LAG_RATIO = 4.0
 # Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -69,7 +69,7 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of each of several jumps without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum ratio of a jump without a change of reset_counter to the median change of nearby steps
+# Minimum size of a jump without a change of reset_counter ÷ median change between nearby steps
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
 # Number of position changes in the median with which a jump is compared
 MEDIAN_CHANGE_COUNT = 61
@@ -78,7 +78,8 @@ MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum duration (s), and minimum number of positions, of the shift by a jump: outliers are
 # shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# Maximum ratio of the difference between the jump and the shift of the median position to the jump
+# A jump lasts if the medians of the positions before and after it differ by the size of the jump,
+# to within this fraction of the size
 MAX_LASTING_RATIO = 0.5
 # Maximum interval (median intervals) before a jump: in a longer gap the vehicle moves
 MAX_JUMP_INTERVAL_RATIO = 1.5
@@ -88,7 +89,7 @@ MIN_RETURN_FRACTION = 0.7
 MAX_JUMP_TO_RESET_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
-# Maximum difference (s) between the time of a position and the time of its reset_counter
+# Maximum rounding difference (s) between the time of a position and that of its reset_counter
 RESET_TOLERANCE_S = 1e-4
 # Bits of EKF2_EV_CTRL: horizontal position, and height
 HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
@@ -108,7 +109,7 @@ MIN_OUTLIER_FRACTION = 0.005
 MIN_OUTLIER_FRACTION_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Minimum fraction of positions with a logged innovation, for counting rejected outliers
+# Rejected outliers are counted only if the log has the innovations of this fraction of positions
 MIN_INNOVATION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
@@ -143,7 +144,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # at a high rate, the time offset determines the lag better than the correlation does
+    # at a high rate, the time offset (negative for a lag) is more accurate than the correlation
     limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
     if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
@@ -167,10 +168,11 @@ def detect_low_pass(analysis: Analysis) -> Findings:
         yield make_finding(
             "source_low_pass_filtered",
             f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
-            f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
-            f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
-            "independent errors, so both are overconfident and lag.",
-            f"{source_words(analysis.source).smoothing_action} Leave the timestamps as they are.",
+            f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
+            f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
+            "m. KF and EKF2 assume independent errors, so both are overconfident and lag.",
+            f"{source_words(analysis.source).smoothing_action} Do not change the timestamps, "
+            "because the positions are late, not the timestamps.",
             asdict(low_pass),
         )
 
@@ -230,11 +232,11 @@ def make_height_only_finding(analysis: Analysis) -> Finding:
     x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
     parameter = EV_POS.switch
     control = int(log.parameters.get(parameter, HEIGHT_ONLY_CONTROL))
-    action = f"Leave {parameter} at {control} (no horizontal position): it is correct."
+    action = f"Leave {parameter} at {control}, so that EKF2 does not fuse x and y."
     if control & HORIZONTAL_CONTROL:
         action = (
             f"Set {parameter} to {control & ~HORIZONTAL_CONTROL | HEIGHT_ONLY_CONTROL} (height "
-            "only): now EKF2 fuses the constant x and y."
+            "only), so that EKF2 does not fuse the constant x and y."
         )
     return warning(
         "source_height_only",
@@ -278,20 +280,23 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         )
     listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_return = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
-    counter_text = "and its reset_counter rises at each jump"
-    cause = "the source (VIO or SLAM) drifts and corrects its drift"
+    counter_text = "and its reset_counter increases at each jump"
+    cause_sentence = "The source (VIO or SLAM) drifts and corrects its drift."
     if not is_announced:
-        counter_text = "without a change of reset_counter"
-        cause = f"possible causes are {source_words(analysis.source).jump}"
+        counter_text = "without a change of its reset_counter"
+        cause_sentence = f"Possible causes: {source_words(analysis.source).jump}."
     action = "Improve the tracking of the source, or correct the drift in smaller steps."
     if is_return.mean() >= MIN_RETURN_FRACTION:
-        cause = f"the source measures two points in turn, {np.median(sizes_m):.2f} m apart"
+        cause_sentence = (
+            "The source alternately sends the positions of two points, "
+            f"{np.median(sizes_m):.2f} m apart."
+        )
         action = "Send the position of the same point of the vehicle, for example of one tag."
     yield error(
         "source_relocalises",
         f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter_text}. The "
-        f"jumps are at {listed_times} s, about every {np.median(np.diff(times_s)):.0f} s: {cause}."
-        f"{reset_sentence}",
+        f"jumps are at {listed_times} s, about every {np.median(np.diff(times_s)):.0f} s. "
+        f"{cause_sentence}{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
         zero_length_spans(times_s.tolist()),
@@ -299,9 +304,10 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 
 
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
-    """Return time (s) and step (m) of the jumps, and True if ``reset_counter`` announces them.
+    """Return time (s) and step (m) of the jumps, and True if ``reset_counter`` changes with them.
 
-    Jumps that are not announced must last, and be far above the noise.
+    Jumps without a change of the counter count only if they last for :data:`MIN_LASTING_S` and are
+    :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
@@ -311,11 +317,11 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
         return [], False
     excess_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
     excess_sizes_m, intervals_s = np.linalg.norm(excess_steps_m, axis=1), np.diff(time_s)[1:-1]
-    counter_rows = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
-    counter_rows = counter_rows[(counter_rows >= 0) & (counter_rows < len(excess_sizes_m))]
-    counter_rows = counter_rows[excess_sizes_m[counter_rows] >= MIN_JUMP_M]
-    if len(counter_rows) >= MIN_ANNOUNCED_JUMPS:
-        return [(float(time_s[row + 2]), excess_steps_m[row]) for row in counter_rows], True
+    reset_rows = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
+    reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(excess_sizes_m))]
+    reset_rows = reset_rows[excess_sizes_m[reset_rows] >= MIN_JUMP_M]
+    if len(reset_rows) >= MIN_ANNOUNCED_JUMPS:
+        return [(float(time_s[row + 2]), excess_steps_m[row]) for row in reset_rows], True
     median_change_m = (
         pd.Series(excess_sizes_m).rolling(MEDIAN_CHANGE_COUNT, center=True, min_periods=1).median()
     )
@@ -401,8 +407,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {words.outliers}. KF has "
-        "no gate and follows each "
+        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {words.outliers}. KF "
+        "rejects no outliers and follows each "
         f"outlier.{_rejected_outliers_sentence(analysis, outlier_times_s)}",
         words.outliers_action,
         {
@@ -473,7 +479,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
         if direction == "large" and rmse_m is None:
             correlation_note = " The reported σ may include time-correlated errors."
         severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
-        effect = "EKF2 uses this variance (EKF2_EV_NOISE_MD 0), but at least EKF2_EVP_NOISE²."
+        effect = "EKF2 uses this variance or EKF2_EVP_NOISE², the larger one (EKF2_EV_NOISE_MD 0)."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
             severity, effect = "note", "EKF2 does not use this variance (EKF2_EV_NOISE_MD 1)."
         yield finding(

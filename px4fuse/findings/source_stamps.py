@@ -32,7 +32,7 @@ MIN_LATENCY_S = 0.02
 MIN_LATENCY_ERROR_S = 0.10
 # Minimum rank correlation of latency and time, if the latency grows in flight
 MIN_LATENCY_TREND = 0.8
-# Minimum number of positions before, and also after, the convergence of TIMESYNC
+# Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
 MIN_SAMPLES = 10
 # Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
 # measurement times after the convergence
@@ -59,15 +59,19 @@ def detect(analysis: Analysis) -> Findings:
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
-        kf_times = (
-            f"KF uses the timestamps of the messages, mapped to boot time by the {clock.method}."
+        kf_times_sentence = (
+            "KF uses the timestamps of the messages, converted to the autopilot's boot clock by "
+            f"the {clock.method}."
         )
         if clock.method == "arrival time":
-            kf_times = "KF uses arrival times, too, so its track is late by the position latency."
+            kf_times_sentence = (
+                "KF also uses arrival times, so its track is late by the position latency."
+            )
         yield warning(
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            f"arrival times as times of measurement. {kf_times}{_describe_bursts(analysis)}",
+            "arrival times as times of measurement. "
+            f"{kf_times_sentence}{_describe_bursts(analysis)}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
@@ -93,9 +97,10 @@ def detect_shared_timestamps(
     yield error(
         "source_timestamps_shared",
         f"The timestamps of the {positions_phrase(analysis.source)} have a resolution of "
-        f"{resolution_s:.3g} s. {sample_count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
-        "timestamps. px4fuse uses the first sample of each timestamp. At 1 m/s a rounded "
-        f"timestamp is a position error of up to {format_metres(resolution_s)} m.",
+        f"{resolution_s:.3g} s. The {sample_count} samples ({rate_hz:.2g} Hz) have only "
+        f"{distinct_count} different timestamps. px4fuse uses the first sample of each timestamp. "
+        "At 1 m/s the rounding is a position error of up to "
+        f"{format_metres(resolution_s)} m.",
         "Send the time of measurement with a resolution of microseconds.",
         {"resolution_s": resolution_s, "samples": sample_count, "distinct": distinct_count},
     )
@@ -110,7 +115,8 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
         fusion_flags["horizontal"], segment
     ):
         fusion_sentence = (
-            f"EKF2 never fused the positions: it reads them as {AGE_BY_WRONG_TIMESTAMP[clock]}. "
+            f"EKF2 never fused the positions, because it treats them as "
+            f"{AGE_BY_WRONG_TIMESTAMP[clock]}. "
         )
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(
@@ -216,7 +222,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # number of contradicting timestamps, if TIMESYNC converged after this position
+    # for each position as the last one before convergence: number of timestamps that do not fit
     contradicting_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
@@ -236,7 +242,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _position_age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the age (s) of each position when PX4 publishes it, if logged."""
+    """Return the publication time of each position minus its timestamp_sample (s), if logged."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if (

@@ -28,7 +28,8 @@ MAX_LEVER_ARM_RMSE_RATIO = 0.7
 MIN_SENDER_DISTANCE_M = 0.1
 # Minimum distance (σ) between the positions of two senders: white noise of one sender reaches 2 σ
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Number of samples in a window for detecting two senders: short, because a lost sample swaps them
+# Number of samples in a window for detecting two senders: short, because a lost sample exchanges
+# the senders of odd and even samples
 WINDOW_SAMPLES = 16
 # Minimum number of windows for detecting two senders: in fewer windows, outliers of one sender
 # resemble a second sender
@@ -76,7 +77,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    # rows of one span have the same valid sample before them
+    # a span ends at the next valid sample, so its rows have the same number of valid samples before
     valid_count_before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
@@ -97,7 +98,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             sum(end - start for start, end in spans),
         )
         fault = fault_template.format(positions=f"{count} {positions_phrase(source)}")
-        times = f"{len(spans)} spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
+        times = f"{len(spans)} parts from {spans[0][0]:.1f} s to {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
@@ -121,7 +122,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 
 def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
-    """Return the times of the last valid measurement before a span and the first one after it."""
+    """Return the times (s) of the last measurement before a span and of the first after it."""
     time_s = analysis.input_axes[0].measurement_time_s
     indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
@@ -145,7 +146,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     yield warning(
         "source_positions_rounded",
         f"{positions_phrase(source)} move in steps of {step_m:.3g} m. {cause} The rounding error "
-        f"is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. {NO_ESTIMATES}",
+        f"is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. {NO_ESTIMATES}",
         action,
         {"step_m": step_m},
     )
@@ -176,10 +177,10 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
     yield warning(
         "source_lever_arm",
-        f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
-        f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
-        "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
-        f"lever arm. {effect_sentence}{NO_ESTIMATES}",
+        f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting point "
+        f"that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
+        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the positions "
+        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
@@ -238,9 +239,9 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     )
     yield error(
         "source_two_senders",
-        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Every other "
-        f"one of the {positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differs by "
-        f"{distance_texts}. {NO_ESTIMATES}",
+        f"Two systems alternately send positions that differ by {distance_m:.2f} m. Successive "
+        f"{positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differ by "
+        f"{distance_texts}, in addition to the motion. {NO_ESTIMATES}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
@@ -275,21 +276,21 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     copied_quantity = "position and attitude" if is_copied else "position"
     yield error(
         "source_is_ekf2_estimate",
-        f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal "
-        f"EKF2's position {1e3 * COPY_DELAYS_S[best_index]:.0f} ms earlier (median difference "
-        f"{1e3 * distances_m[best_index]:.1f} mm). They contain no measurement: EKF2's σ "
-        "decreases, its error does not.",
+        f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
+        f"that EKF2 estimated {1e3 * COPY_DELAYS_S[best_index]:.0f} ms before (median difference "
+        f"{1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so fusion reduces "
+        "EKF2's σ, but not its error.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
         {"delay_s": float(COPY_DELAYS_S[best_index]), "difference_m": distances_m[best_index]},
     )
 
 
-def _median_distance_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
+def _median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
     """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
-    state_times_s = state.index.to_numpy()
+    state_times_s = ekf2_state.index.to_numpy()
     state_curve = CubicHermiteSpline(
-        state_times_s, state[Columns.POSITION], state[Columns.VELOCITY]
+        state_times_s, ekf2_state[Columns.POSITION], ekf2_state[Columns.VELOCITY]
     )
     is_moving = np.linalg.norm(state_curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
     is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving

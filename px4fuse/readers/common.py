@@ -63,6 +63,10 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
     )
 
 
+# Maximum probability that a source with random repetitions has a run that counts as lost tracking
+MAX_RANDOM_RUN_PROBABILITY = 0.01
+
+
 def finite_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
@@ -99,10 +103,13 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
         valid_rows = valid_rows[~is_far]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
+    # longest run that is likely in a source that repeats positions at random
+    repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
+    random_count = np.log(len(valid_rows) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(repeated_fraction)
     held_rows = [
         valid_rows[run_start + 1 : run_end]
         for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
-        if run_end - run_start >= MIN_HELD_COUNT
+        if run_end - run_start >= max(MIN_HELD_COUNT, random_count)
         and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_HELD_S
     ]
     if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid_rows):
