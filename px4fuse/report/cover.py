@@ -1,4 +1,4 @@
-"""First page of a report: the diagnosis card, and plots below it."""
+"""First page of a report: the diagnosis card (a summary), and plots below it."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -50,8 +50,8 @@ PLACE_NAMES = {"shell": "your computer", "console": "MAVLink Console of QGroundC
 ALL_FINDINGS = "All findings"
 
 
-def draw(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots of a comparison in the space below it."""
+def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+    """Draw the cover: the diagnosis card, and plots in the space below it."""
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
@@ -60,7 +60,7 @@ def draw(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Itera
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add a diagnosis card to a page."""
+    """Add a diagnosis card to a page; plots can be added to ``blocks`` of the returned block."""
     identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
     flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
     more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"

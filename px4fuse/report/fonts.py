@@ -9,8 +9,8 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
-FONT = "DejaVu Sans"
+from px4fuse.report.style import FONT
+
 # Words in the names of fonts that draw a box for every character
 BOX_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"

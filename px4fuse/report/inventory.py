@@ -13,7 +13,7 @@ from px4fuse.request import ComparisonRequest, command_line
 SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
 
 
-def summary(inventory: Inventory, request: ComparisonRequest) -> Page:
+def log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     """List the contents of a log, the possible analyses, and the ``compare`` command."""
     page = Page()
     page.write(inventory.flight.log.name, bold=True)

@@ -60,7 +60,7 @@ TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
         page = Page(appendix_title(TITLE), LEAD_TEXT)
@@ -120,14 +120,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 def _draw_reference(axes: Axes, loop: Loop) -> None:
     """Draw the reference trajectory in the frame of the odometry."""
     for reference in loop.references[:1]:
-        score = loop.best.scores.get(reference.name)
-        if isinstance(score, Evaluation):
-            reference_m = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
+        evaluation = loop.best.scores.get(reference.name)
+        if isinstance(evaluation, Evaluation):
+            reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
             line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
-            plot_path(axes, reference_m, score.time_s, **line)
+            plot_path(axes, reference_m, evaluation.time_s, **line)
 
 
-def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
+def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     """Make the terminal output on a loop: closure error, corrected paths and findings."""
     page = Page()
     write_loop(page, loop)
@@ -232,8 +232,8 @@ def describe_closure_error(loop: Loop) -> str:
     length_m = loop.path_length_m
     if error_m is None or error_axes_m is None:
         if loop.is_assessed:
-            return f"not stated for an assignment; the path is {length_m:.1f} m long"
-        return f"the path of {length_m:.1f} m does not return to its start (--open)"
+            return f"hidden in an assignment; the path is {length_m:.1f} m long"
+        return f"none: --open states that the path of {length_m:.1f} m does not return to its start"
     text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_axes_m)}"
@@ -295,7 +295,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
 
 
-def graph_summary(solved_graph: Graph) -> Page:
+def pose_graph_page(solved_graph: Graph) -> Page:
     """Make the terminal output on a pose graph: tested closures, solver and costs."""
     page, gates = Page(), solved_graph.gates
     page.write_labelled(

@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import Block, Page
-from px4fuse.report.phrases import filters_by_name, format_verdict
+from px4fuse.report.phrases import format_verdict, statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_DOTS,
     TRACK_LINES,
@@ -27,14 +27,14 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Ratio of the limit of the innovation plot to the largest drawn innovation, for a margin
+# Ratio of the limit of the axis of innovations to the largest drawn innovation
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# Maximum limit (in √S) of the innovation plot, without the margin
+# Maximum innovation (multiple of the median √S) that enlarges the axis of innovations
 MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Position or velocity: its unit, and its names in tables and results."""
+    """Position or velocity: unit, columns of value and variance, fields of RMSE and median σ."""
 
     unit: str
     column: str
@@ -134,7 +134,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
 
-def _position_sentence(_: Analysis, result: AxisComparison) -> str:
+def _measurements_sentence(_: Analysis, result: AxisComparison) -> str:
     extent_m = float(np.ptp(result.axis.measurement_m))
     return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
@@ -142,7 +142,7 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
 def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
-        for name, filter_summary in filters_by_name(result).items()
+        for name, filter_summary in statistics_by_filter(result).items()
         if (rmse := getattr(filter_summary.truth, quantity.rmse, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
@@ -229,7 +229,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
     axis_limit_m, sentences = _innovation_axis_limit_m(result), []
     innovation_tables = _innovation_tables(result)
-    for name, consistency in filters_by_name(result).items():
+    for name, consistency in statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
@@ -253,7 +253,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
 def _fraction_outside_text(result: AxisComparison) -> str:
     fractions = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
-        for name, consistency in filters_by_name(result).items()
+        for name, consistency in statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     )
     return f"{fractions} outside ±2√S (expected 5 %)" if fractions else ""
@@ -289,7 +289,7 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
 
 def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
     texts = []
-    for name, filter_summary in filters_by_name(result).items():
+    for name, filter_summary in statistics_by_filter(result).items():
         median = getattr(filter_summary, quantity.sigma)
         text = "not logged" if median is None else f"{median:.3f} {quantity.unit}"
         texts.append(f"{name} {text}")
@@ -300,7 +300,7 @@ POSITION = Panel(
     "Position (m)",
     150.0,
     partial(draw_tracks, quantity=POSITIONS),
-    _position_sentence,
+    _measurements_sentence,
     _position_difference_text,
 )
 VELOCITY = Panel(

@@ -22,6 +22,7 @@ else:  # text-only commands do not import matplotlib (0.3 s)
     Artist = Axes = Any
 __all__ = ["Artist", "Axes"]  # matplotlib types for annotations
 
+# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"

@@ -210,10 +210,10 @@ def _repeat_loop(
 
 def _draw_report(analysis: object, results: ReportedResults, versions: Provenance) -> bytes:
     """Draw the report with the library versions that the submitted report states."""
-    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(versions, command=results.provenance.command)
-    return render(analysis, replace(results, provenance=new_provenance), to_json(results))
+    return render_pdf(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
 # ------------------------------------------------------------------ the verdict
