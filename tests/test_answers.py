@@ -16,15 +16,15 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.results.answer_form import (
-    MISTAKES,
-    StudentMistake,
-    draw_questions,
+    FAULT_KINDS,
+    NamedFault,
     form_text,
     read_answers,
+    select_questions,
 )
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.reading import read_results
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.mistakes import FAULT_KINDS as SIMULATED
 
 SHA256 = "b" * 64
 EMPTY = form_text("s07.ulg", SHA256)
@@ -41,8 +41,8 @@ def test_empty_answer_form_lists_every_possible_fault(tmp_path: Path) -> None:
     found = read(tmp_path, EMPTY)
     assert found.log_sha256 == SHA256
     assert (found.mistakes, found.quantities) == ((), (None, None, None))
-    assert set(SIMULATED) < set(MISTAKES)
-    for name in MISTAKES:
+    assert set(SIMULATED) < set(FAULT_KINDS)
+    for name in FAULT_KINDS:
         assert f"#     {name} " in EMPTY
 
 
@@ -55,8 +55,8 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
     assert found.verdict_kf == "underconfident"
-    assert StudentMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
-    assert StudentMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
+    assert NamedFault("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
+    assert NamedFault("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_read_invalid_answer_form_names_line_in_one_line_error(
 
 
 def test_answer_form_questions_differ_for_each_log() -> None:
-    drawn = {draw_questions(f"{n:064x}") for n in range(200)}
+    drawn = {select_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
     assert kinds == {"gain", "variance", "innovation", "nis", "prediction", "gate"}
@@ -118,7 +118,7 @@ def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
-        q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "prediction"
+        q for n in range(99) for q in select_questions(f"{n:064x}") if q.kind == "prediction"
     )
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
     run = replay(main.axis, settings)
@@ -148,7 +148,7 @@ def test_compare_with_answers_option_prints_answers_in_report(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.names_no_mistake  # type: ignore[union-attr]
+    assert results.student.answers.names_no_fault  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 

@@ -20,14 +20,14 @@ from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_a
 from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
+    FAULT_COUNT_FRACTIONS,
     HARDEST_DIFFICULTY,
     LOOP_FRACTION,
-    MISTAKE_COUNT_FRACTIONS,
     RULES_BY_KIND,
     UNDETECTABLE_DIFFICULTY,
     UNDETECTABLE_FRACTION,
+    assign_random_flight,
     derive_key,
-    draw,
 )
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.diagnose import find_faults
@@ -85,46 +85,57 @@ class TestDraw:
         given = SECRET, CLASS[0], "aisle", 2, True
         assert simulate_assigned_flight(*given) == assignment.simulate_assigned_flight(*given)
         # the id as another platform may spell it
-        assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
+        assert assign_random_flight(SECRET, "S1 ", "aisle") == assign_random_flight(
+            SECRET, "s1", "aisle"
+        )
 
     def test_simulated_assignment_with_known_secret_equals_reference(self):
-        drawn = draw(SECRET, "s1", "aisle", 2)
+        drawn = assign_random_flight(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
         assert scenario.truth
-        assert not draw(SECRET, "s1", "loop").scenario.truth
-        assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
+        assert not assign_random_flight(SECRET, "s1", "loop").scenario.truth
+        assert not assign_random_flight(SECRET, "s1", "aisle", truth=False).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.mistake_options == PINNED[1]
-        loops = [n for n in range(12) if draw(SECRET, f"s{n}", "mixed").scenario.kind == "loop"]
+        loops = [
+            n
+            for n in range(12)
+            if assign_random_flight(SECRET, f"s{n}", "mixed").scenario.kind == "loop"
+        ]
         assert loops == [1, 5, 9, 11]
 
     @pytest.mark.parametrize("kind", ["aisle", "loop", "mixed"])
     def test_simulated_assignments_of_two_students_differ(self, kind):
-        drawn = [draw(SECRET, f"s{n}", kind).scenario for n in range(200)]
-        drawn += [draw(b"another secret", f"s{n}", kind).scenario for n in range(200)]
+        drawn = [assign_random_flight(SECRET, f"s{n}", kind).scenario for n in range(200)]
+        drawn += [
+            assign_random_flight(b"another secret", f"s{n}", kind).scenario for n in range(200)
+        ]
         assert len({one.seed for one in drawn}) == 400
         assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
 
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
     def test_simulated_assignments_contain_configured_fault_count(self, kind):
-        flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
-        for count, share in enumerate(MISTAKE_COUNT_FRACTIONS[kind]):
+        flights = [assign_random_flight(SECRET, f"s{n}", kind) for n in range(1000)]
+        for count, share in enumerate(FAULT_COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in RULES_BY_KIND[kind].mistakes}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
-        mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
+        mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
-        assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
+        assert all(
+            one == assign_random_flight(SECRET, f"s{n}", one.scenario.kind)
+            for n, one in enumerate(mixed)
+        )
 
     def test_two_faults_in_assigned_flight_are_compatible(self):
         signs = Counter()
         for n in range(300):
-            drawn = draw(SECRET, f"s{n}", "aisle", 2)
+            drawn = assign_random_flight(SECRET, f"s{n}", "aisle", 2)
             first, second = choices_of(drawn)
             assert first.is_detectable_with(second)
             assert second.is_detectable_with(first)
@@ -168,14 +179,14 @@ class TestDraw:
             assert set(larger) <= {choice.detectable_size, *found}
 
     def test_assigned_flights_cover_full_range_of_difficulty(self):
-        each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
+        each = [assign_random_flight(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
         assert undetectable_count / len(each) == pytest.approx(UNDETECTABLE_FRACTION, abs=0.06)
 
     def test_assigned_flight_seeds_have_128_bits(self):
-        seeds = [draw(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
+        seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
         assert max(seeds).bit_length() == 128
 
 
@@ -195,7 +206,7 @@ def test_each_fault_in_assigned_log_is_detected_by_analysis(
         found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
         found = find_faults(compare(flight, axes=("north", "east"))).findings
-    drawn = draw(SECRET, CLASS[number].student_id, kind, count)
+    drawn = assign_random_flight(SECRET, CLASS[number].student_id, kind, count)
     wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count
     assert wanted <= {finding.id for finding in found}
@@ -226,7 +237,7 @@ class TestAssign:
         for answer in key.answers:
             assert hashlib.sha256(logs[answer.file]).hexdigest() == answer.sha256
             assert len(answer.mistakes) == 2
-            assert answer.truth["sigma_z_m"] == answer.scenario["sigma_uwb_m"]
+            assert answer.true_values["sigma_z_m"] == answer.scenario["sigma_uwb_m"]
         assert len(set(logs.values())) == 9
         form = read_answers(folder / "s00.answers.toml")
         assert form == Answers(log_sha256=key.answers[0].sha256, quantities=(None,) * 3)

@@ -20,7 +20,7 @@ from px4fuse.classroom.grading.class_page import class_page_html, count_tenths
 from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.classroom.grading.outputs import anonymise_entry
 from px4fuse.html.safe import MAX_TEXT_LENGTH
-from px4fuse.results.answer_form import Answers, StudentMistake
+from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.verification.model import Mismatch, PageDifference, Verification
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
@@ -58,7 +58,7 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
 
 FORM = Answers(
     log_sha256="a" * 64,
-    mistakes=(StudentMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
+    mistakes=(NamedFault(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
 )
 CLASS = (
     row(

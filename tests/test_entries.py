@@ -26,7 +26,7 @@ from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.classroom.grading.submissions import parse_origin
 from px4fuse.errors import SettingsError
-from px4fuse.results.answer_form import Answers, StudentMistake
+from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.verification.model import Verification
 
 DUE = parse_due_time("2026-11-20 12:00:00 +01:00")
@@ -144,7 +144,7 @@ def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
 
 
 def of_form(points: float, kind: str, **more):
-    form = Answers(log_sha256="a" * 64, mistakes=(StudentMistake(kind),))
+    form = Answers(log_sha256="a" * 64, mistakes=(NamedFault(kind),))
     return replace(graded_report("", points, student_id="1"), form=form, **more)
 
 

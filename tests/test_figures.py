@@ -7,14 +7,14 @@ from functools import partial
 import pytest
 
 from px4fuse.classroom.assignment import figures
-from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS, draw_choices, draw_figures
-from px4fuse.classroom.assignment.random_assignment import draw_uniform
+from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS, draw_figures, select_choices
+from px4fuse.classroom.assignment.random_assignment import random_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
 def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
     for number in range(20):
-        choices = draw_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
+        choices = select_choices(partial(random_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
@@ -26,8 +26,8 @@ def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
 
 
 def test_right_choices_of_figure_questions_are_equally_frequent() -> None:
-    draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
-    letters = [letter for draw_number in draws for _, letter in draw_choices(draw_number)]
+    draws = [partial(random_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
+    letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
     for name in CHOICE_NAMES:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
@@ -39,8 +39,8 @@ def test_answers_to_figure_questions_differ_between_faults() -> None:
 
 def test_figures_of_same_secret_and_student_are_equal(monkeypatch) -> None:
     monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
-    draw_number = partial(draw_uniform, b"secret", "s1", "aisle")
-    content = draw_figures(draw_number)
+    random_number = partial(random_uniform, b"secret", "s1", "aisle")
+    content = draw_figures(random_number)
     assert content.startswith(b"\x89PNG")
-    assert content == draw_figures(draw_number)
-    assert content != draw_figures(partial(draw_uniform, b"secret", "s2", "aisle"))
+    assert content == draw_figures(random_number)
+    assert content != draw_figures(partial(random_uniform, b"secret", "s2", "aisle"))

@@ -15,18 +15,18 @@ from exchange import replace
 from form_guesses import SHA256, right
 from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
-from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
+from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.form_points import form_points
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import (
+    FAULT_KINDS,
     MAX_MISTAKES,
-    MISTAKES,
     Answers,
-    StudentMistake,
+    NamedFault,
     read_answers,
 )
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.mistakes import FAULT_KINDS as SIMULATED
 
 FIRST = 'kind = "clock-offset"\nsize = 0.19\nunit = "s"\nwhen = "whole flight"\n'
 HONEST = f"""log_sha256 = "{"a" * 64}"
@@ -50,7 +50,7 @@ q1 = 0.505
 q2 = [3, 7]
 q3 = -0.2
 """
-NAMES = [name for name in MISTAKES if name != "none"]
+NAMES = [name for name in FAULT_KINDS if name != "none"]
 
 
 def changed(old: str, new: str) -> str:
@@ -65,7 +65,7 @@ def of_kinds(*kinds: str, size: float | None = 0.0) -> str:
     for kind in kinds:
         default = SIMULATED[kind].default if kind in SIMULATED else 0.0
         number = float(default if size is None else size)
-        size_text = f"size = {number}\n" if MISTAKES[kind].units else ""
+        size_text = f"size = {number}\n" if FAULT_KINDS[kind].units else ""
         blocks.append(f'[[mistake]]\nkind = "{kind}"\n{size_text}when = "whole flight"\n')
     return head + "".join(blocks) + "[quantities]" + end.partition("[quantities]")[2]
 
@@ -181,14 +181,14 @@ def test_two_students_with_equal_figure_answers_are_flagged() -> None:
 
 # ------------------------------------------------------------------ answers of honest students
 
-OFF = TrueMistake("ekf2-off")
+OFF = InjectedFault("ekf2-off")
 OFF_TRUTH = FormTruth(
     (OFF,), 0.1, VerdictTruth("consistent"), VerdictTruth(""), ("never fused",),
     ("followed wrong positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
-NLOS_TRUTH = replace(TRUTH, mistakes=(TrueMistake("nlos", 3.0, 2.5, 3.5, 10.0, 60.0), GAP))
-COMPASS_TRUTH = replace(TRUTH, mistakes=(TrueMistake("heading", 20.0, 17.0, 23.0, 30.0), GAP))
-END_TRUTH = replace(TRUTH, mistakes=(TrueMistake("open-end", 5.0, 4.7, 5.3, 60.0),))
+NLOS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("nlos", 3.0, 2.5, 3.5, 10.0, 60.0), GAP))
+COMPASS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("heading", 20.0, 17.0, 23.0, 30.0), GAP))
+END_TRUTH = replace(TRUTH, mistakes=(InjectedFault("open-end", 5.0, 4.7, 5.3, 60.0),))
 
 
 def first_mistake(truth: FormTruth, **values) -> Answers:
@@ -225,8 +225,8 @@ HONEST_FORMS: dict[str, tuple[FormTruth, Answers, float]] = {
         100.0,
     ),
     "factor instead of percent": (
-        replace(TRUTH, mistakes=(TrueMistake("scale", 14.0, 12.0, 16.0),)),
-        replace(RIGHT, mistakes=(StudentMistake("scale", 1.14, "factor"),)), 70.0,
+        replace(TRUTH, mistakes=(InjectedFault("scale", 14.0, 12.0, 16.0),)),
+        replace(RIGHT, mistakes=(NamedFault("scale", 1.14, "factor"),)), 70.0,
     ),
 }  # fmt: skip
 

@@ -14,8 +14,8 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.classroom.assignment.random_assignment import draw
-from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
+from px4fuse.classroom.assignment.random_assignment import assign_random_flight
+from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth, form_truth
 from px4fuse.classroom.grading.form_points import (
     PART_NAMES,
     POINTS_TABLE,
@@ -26,21 +26,21 @@ from px4fuse.classroom.grading.form_points import (
 from px4fuse.cli.simulate import simulate
 from px4fuse.results.answer_form import (
     CORRECTIONS,
-    MISTAKES,
+    FAULT_KINDS,
     PANELS,
     Answers,
     Choice,
-    StudentMistake,
+    NamedFault,
     update_renamed_values,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.mistakes import FAULT_KINDS as SIMULATED
 from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
-LATE = TrueMistake("clock-offset", 0.2, 0.17, 0.23)
-GAP = TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
+LATE = InjectedFault("clock-offset", 0.2, 0.17, 0.23)
+GAP = InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
     (LATE, GAP), 0.1, VerdictTruth("overconfident", 2.0), VerdictTruth("underconfident", 1.3),
     ("followed wrong positions", "dead-reckoned, then reset"), ("fused at the wrong time",),
@@ -49,7 +49,7 @@ TRUTH = FormTruth(
 RIGHT = Answers(
     log_sha256=SHA256,
     mistakes=(
-        StudentMistake(
+        NamedFault(
             "clock-offset",
             190.0,
             "ms",
@@ -61,7 +61,7 @@ RIGHT = Answers(
             "s",
             "clock",
         ),
-        StudentMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
+        NamedFault("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
     ),
     verdict_kf="overconfident",
     verdict_ekf2="underconfident",
@@ -82,7 +82,7 @@ def with_claim(**values: Any) -> Answers:
 
 def with_false(*kinds: str) -> Answers:
     """Return the correct form with additional mistakes."""
-    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(StudentMistake, kinds)))
+    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(NamedFault, kinds)))
 
 
 def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
@@ -91,10 +91,10 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
 
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
-    assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
+    assert set(SIMULATED) == set(FAULT_KINDS) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = accepted_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
         assert set(panels_showing(name)) > {"cover"}
@@ -141,7 +141,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
+    (replace(RIGHT, mistakes=(NamedFault("none"),)), NO_MISTAKES),
     (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
@@ -158,7 +158,7 @@ def test_partly_correct_answer_form_has_partial_points(
 
 
 def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
-    none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
+    none = Answers(log_sha256=SHA256, mistakes=(NamedFault("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).fraction == 0.4
     whole = replace(
@@ -170,9 +170,9 @@ def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
 
 
 def test_answer_loop_error_without_size_earns_partial_points() -> None:
-    landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
+    landed = InjectedFault("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
-    claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
+    claim = NamedFault("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
     guess = Answers(log_sha256=SHA256, mistakes=(claim,))
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
@@ -187,10 +187,10 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
     rng = np.random.default_rng(7)
     truths = []
     for number in range(300):
-        drawn = draw(b"constant forms", f"s{number}", "loop")
+        drawn = assign_random_flight(b"constant forms", f"s{number}", "loop")
         sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.mistake_options]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
-        wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
+        wrong = [InjectedFault("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
         verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)
         truths.append(FormTruth(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ())))
     for kind in ("open-end", "none"):
@@ -231,9 +231,9 @@ def answers_of(form: dict[str, Any]) -> Answers:
         parameter = one["parameter"] if one["parameter"] in CORRECTIONS else ""
         unit = one["value_unit"] if one["value_unit"] in CORRECTIONS.get(parameter, {}) else ""
         claims.append(
-            StudentMistake(
+            NamedFault(
                 one["kind"], one["size"],
-                "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
+                one["unit"] * (one["unit"] != next(iter(FAULT_KINDS[one["kind"]].units), "")),
                 "whole flight" if when["text"] == "whole flight" else "", when["from_s"],
                 when["until_s"], parameter, distance(one["value"]), unit, one["where"]["panel"],
             )

@@ -18,14 +18,14 @@ from results_tools import (
 )
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
+from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.classroom.grading.model import Entry, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
 from px4fuse.findings import TITLES
-from px4fuse.results.answer_form import Answers, StudentMistake
+from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.simulation.flights import SIMULATION_HARDWARE
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
@@ -72,7 +72,7 @@ def test_report_without_log_earns_no_points_for_verification():
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
     assert "Hand in aisle_uwb.ulg" in feedback_words(graded(verdict=verdict))
-    other = replace(verdict, reasons=("made with another version",), missing="")
+    other = replace(verdict, reasons=("made with another version",))
     points, comment = check_points("verified", verdict=other)
     assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
@@ -158,7 +158,7 @@ def test_report_with_undeterminable_time_offset_earns_points():
 
 
 TRUTH = FormTruth(
-    (TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
+    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
     VerdictTruth("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
@@ -355,7 +355,7 @@ class TestFeedback:
         ({"settings__end_s": 50.0}, ()),
         ({"settings__input": "zero"}, ("IMU",)),
         ({"log__hardware": SIMULATION_HARDWARE}, ("simulate",)),
-        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
+        ({"source__path": "observation logged by EKF2"}, ("logged by EKF2",)),
     ],
 )
 def test_report_with_suspicious_settings_is_flagged(values, said):
@@ -425,9 +425,9 @@ class TestClassFlags:
         }
 
     def test_reports_with_similar_answer_forms_are_flagged(self):
-        claims = StudentMistake("yaw", -20.5), StudentMistake("nlos", 1.23)
+        claims = NamedFault("yaw", -20.5), NamedFault("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
-        other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))
+        other = (NamedFault("nlos", 1.24), NamedFault("yaw", -20.3))
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = flag_equal_contents([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}

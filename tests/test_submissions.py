@@ -314,7 +314,7 @@ def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("limit", "value", "said"),
     [
-        ("MAX_TOTAL_BYTES", 200, "the zip file unpacks to more than"),
+        ("MAX_UNPACKED_BYTES", 200, "the zip file unpacks to more than"),
         ("MAX_ZIP_ENTRIES", 3, "more than 3 entries"),
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],

@@ -13,7 +13,7 @@ from form_guesses import right
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.form_points import DIAGNOSIS_SHARE, form_points
+from px4fuse.classroom.grading.form_points import FLIGHT_SHARE, form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
@@ -118,7 +118,7 @@ def test_answer_form_without_figures_earns_part_of_points() -> None:
     complete = right(answer.form)
     assert form_points(complete, answer.form).fraction == pytest.approx(1.0)
     copied = replace(complete, choices=())
-    assert form_points(copied, answer.form).fraction == pytest.approx(DIAGNOSIS_SHARE)
+    assert form_points(copied, answer.form).fraction == pytest.approx(FLIGHT_SHARE)
     for letter in CHOICE_NAMES:
         guessed = replace(complete, choices=(letter,) * len(answer.form.choices))
         assert form_points(guessed, answer.form).fraction < 0.6

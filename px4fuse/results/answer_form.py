@@ -25,12 +25,12 @@ MAX_FORM_BYTES = 20_000
 # dotted key of 64 kB
 MAX_LINE_LENGTH = 500
 MAX_MISTAKES = 20
-NO_MISTAKE_KIND = "none"
+NO_FAULT_KIND = "none"
 # Text of a table cell for an answer left blank
 EMPTY_CELL = "\u2013"
 
 
-class MistakeKind(Record, rename={"size_quantity": "in"}):
+class FaultKind(Record, rename={"size_quantity": "in"}):
     """Kind of fault that a student can name, with the quantity of its size.
 
     ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
@@ -52,14 +52,14 @@ class AllowedAnswers(Record, rename={"new_by_old_name": "renamed"}):
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
-    mistakes: dict[str, MistakeKind]
+    mistakes: dict[str, FaultKind]
     corrections: dict[str, str]
     new_by_old_name: dict[str, str]
 
 
 _ALLOWED = read_toml(__file__, AllowedAnswers, "form.toml")
 _UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED.units}
-MISTAKES, EKF2_BEHAVIOURS, PANELS = _ALLOWED.mistakes, _ALLOWED.behaviours, _ALLOWED.panels
+FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = _ALLOWED.mistakes, _ALLOWED.behaviours, _ALLOWED.panels
 # Units of the value of a correction (empty without a value), by name of the correction
 CORRECTIONS = {
     name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED.corrections.items()
@@ -113,7 +113,7 @@ class Choice(Record):
         return "\n#     ".join([self.question, *options])
 
 
-class StudentMistake(Record):
+class NamedFault(Record):
     """Fault that a student names in the answer form.
 
     ``from_s`` and ``until_s`` are its start and end (s since the first data). ``parameter`` is the
@@ -134,7 +134,7 @@ class StudentMistake(Record):
 
     def size_in_first_unit(self) -> float | None:
         """Convert the size to the first unit in ``form.toml``, as a factor of 1.05 to 5 %."""
-        units = MISTAKES[self.kind].units
+        units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
         if self.unit == "factor" and self.kind == "scale":
@@ -157,14 +157,14 @@ class Answers(Record, kw_only=True):
     ekf2_did : tuple of str
         Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
-        Answers to the questions of :func:`draw_questions`; for the question about the innovation
+        Answers to the questions of :func:`select_questions`; for the question about the innovation
         gate, the numbers of the KF updates with an innovation outside the gate.
     choices : tuple of str
         Letter that the student chose for each question about a figure; "" if left blank.
     """
 
     log_sha256: Sha256
-    mistakes: Annotated[tuple[StudentMistake, ...], Meta(max_length=MAX_MISTAKES)] = ()
+    mistakes: Annotated[tuple[NamedFault, ...], Meta(max_length=MAX_MISTAKES)] = ()
     verdict_kf: VerdictWord = ""
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
@@ -172,9 +172,9 @@ class Answers(Record, kw_only=True):
     choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
-    def names_no_mistake(self) -> bool:
+    def names_no_fault(self) -> bool:
         """True if the form states that the flight has no injected fault."""
-        return [mistake.kind for mistake in self.mistakes] == [NO_MISTAKE_KIND]
+        return [mistake.kind for mistake in self.mistakes] == [NO_FAULT_KIND]
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
@@ -222,7 +222,7 @@ class FormQuestion(Record):
 GATE_QUESTION_UPDATES = 20
 
 
-def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
+def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
     """Select three questions about KF at random, with the SHA-256 of the log as seed."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
@@ -327,35 +327,34 @@ def _without_blanks(value: Any) -> Any:
 
 def check_answers(answers: Answers) -> None:
     """Raise ValueError if an answer is not allowed or out of range, or a fault is repeated."""
-    kinds = [student_mistake.kind for student_mistake in answers.mistakes]
+    kinds = [named_fault.kind for named_fault in answers.mistakes]
     for kind in kinds:
-        _require_choice("kind", kind, MISTAKES)
+        _require_choice("kind", kind, FAULT_KINDS)
         if kinds.count(kind) > 1:
             raise ValueError(
                 f"the form names the kind {kind!r} twice; name each kind of fault once"
             )
-    if NO_MISTAKE_KIND in kinds and len(kinds) > 1:
+    if NO_FAULT_KIND in kinds and len(kinds) > 1:
         raise ValueError('the form names "none" and a fault; name only one of them')
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
-    for student_mistake in answers.mistakes:
-        fault_kind = MISTAKES[student_mistake.kind]
+    for named_fault in answers.mistakes:
+        fault_kind = FAULT_KINDS[named_fault.kind]
         for field, choices in (
             ("parameter", CORRECTIONS),
             ("panel", PANELS),
             ("unit", fault_kind.units),
-            ("value_unit", CORRECTIONS.get(student_mistake.parameter)),
+            ("value_unit", CORRECTIONS.get(named_fault.parameter)),
         ):
-            chosen_name = getattr(student_mistake, field)
+            chosen_name = getattr(named_fault, field)
             if chosen_name and choices is not None:
-                _require_choice(f"{student_mistake.kind}: {field}", chosen_name, choices)
+                _require_choice(f"{named_fault.kind}: {field}", chosen_name, choices)
         low, high = fault_kind.range
-        size = student_mistake.size_in_first_unit()
+        size = named_fault.size_in_first_unit()
         if size is not None and not low <= size <= high:
             unit = next(iter(fault_kind.units))
             raise ValueError(
-                f"{student_mistake.kind}: size {size:g} is out of range ({low:g} to {high:g} "
-                f"{unit})"
+                f"{named_fault.kind}: size {size:g} is out of range ({low:g} to {high:g} {unit})"
             )
 
 
@@ -379,11 +378,11 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
     template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
-        for number, question in enumerate(draw_questions(log_sha256), start=1)
+        for number, question in enumerate(select_questions(log_sha256), start=1)
     ]
     kind_lines = (
         f"{name:13} {kind.description}{_format_units(kind.units)}"
-        for name, kind in MISTAKES.items()
+        for name, kind in FAULT_KINDS.items()
     )
     return Template(template).substitute(
         log=log_name,
@@ -407,7 +406,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     yield "Verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
-        size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
+        size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units
         value_units = CORRECTIONS.get(mistake.parameter, {})
         value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
         times = (("from", mistake.from_s), ("until", mistake.until_s))
@@ -420,7 +419,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         )
         yield mistake.kind, "; ".join(filter(None, details)) or EMPTY_CELL
     for question, answer in zip(
-        draw_questions(answers.log_sha256), answers.quantities, strict=False
+        select_questions(answers.log_sha256), answers.quantities, strict=False
     ):
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)

@@ -34,7 +34,7 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import (
     FormTruth,
-    TrueMistake,
+    InjectedFault,
     VerdictTruth,
     _ekf2_behaviour,
     quantity_truth,
@@ -47,7 +47,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.loop.model import Loop
 from px4fuse.readers.ulog_topics import ignores_assessed
 from px4fuse.request import ComparisonRequest, Landing, LoopRequest
-from px4fuse.results.answer_form import Answers, draw_questions
+from px4fuse.results.answer_form import Answers, select_questions
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
 SECRET = b"copy strategies"
@@ -61,7 +61,7 @@ KIND_BY_FINDING = {
 }  # fmt: skip
 
 
-def sizes(analysis: Analysis) -> dict[str, TrueMistake]:
+def sizes(analysis: Analysis) -> dict[str, InjectedFault]:
     """Return each fault with the size and times that the outputs state, if they state a size."""
     parameters, found = analysis.flight.log.parameters, {}
     assert isinstance(analysis.flight.imu, pd.DataFrame)
@@ -91,11 +91,11 @@ def sizes(analysis: Analysis) -> dict[str, TrueMistake]:
         low, high = (None, None) if size is None else (size - reach, size + reach)
         until_s = TIMESYNC_CONVERGED_S if kind == "clock-jump" else None
         from_s = analysis.segment.end_s if kind == "open-end" else None
-        found[kind] = TrueMistake(kind, size, low, high, from_s, until_s)
+        found[kind] = InjectedFault(kind, size, low, high, from_s, until_s)
     if analysis.events.gaps:
         start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
         length_s = end_s - start_s
-        found["dropout"] = TrueMistake(
+        found["dropout"] = InjectedFault(
             "dropout", length_s, 0.85 * length_s, 1.15 * length_s, start_s, end_s
         )
     return found
@@ -112,7 +112,7 @@ def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> FormTruth:
     sigma_z_m = (tuning.sigma_z.value if isinstance(tuning, AxisTuning) else None) or 0.1
     behaviour = _ekf2_behaviour(analysis, mistakes, sigma_z_m)
     numbers = tuple(
-        quantity_truth(analysis.main, question) for question in draw_questions(log_sha256)
+        quantity_truth(analysis.main, question) for question in select_questions(log_sha256)
     )
     return FormTruth(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
 

@@ -20,18 +20,18 @@ from msgspec.structs import replace
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
+from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault
 from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
     CORRECTIONS,
     EKF2_BEHAVIOURS,
-    MISTAKES,
+    FAULT_KINDS,
     NOT_AVAILABLE,
     PANELS,
     VERDICTS,
     Answers,
-    StudentMistake,
+    NamedFault,
 )
 
 SECRET = b"form guesses"
@@ -60,10 +60,10 @@ def guess_choices(rng: np.random.Generator, one: FormTruth) -> tuple[str, ...]:
 
 def at_random(rng: np.random.Generator, one: FormTruth) -> Answers:
     """Return a form with random valid answers."""
-    named = [name for name in MISTAKES if name != "none"]
+    named = [name for name in FAULT_KINDS if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
     claims = tuple(
-        StudentMistake(
+        NamedFault(
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
             parameter=str(rng.choice(list(CORRECTIONS))), value=float(rng.lognormal(-1.0, 1.5)),
             panel=str(rng.choice(PANELS)),
@@ -72,7 +72,7 @@ def at_random(rng: np.random.Generator, one: FormTruth) -> Answers:
     )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
-        mistakes=(StudentMistake("none"),) if rng.random() < 1.0 / 3.0 else claims,
+        mistakes=(NamedFault("none"),) if rng.random() < 1.0 / 3.0 else claims,
         verdict_kf=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
@@ -89,7 +89,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
 
     blank = Answers(
         log_sha256=SHA256,
-        mistakes=(StudentMistake("none"),),
+        mistakes=(NamedFault("none"),),
         verdict_kf=common([one.kf.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
@@ -105,9 +105,9 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
     sizes = [wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]
     begins = [wrong.from_s for wrong in of_kind if wrong.from_s is not None] or [0.0]
     for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
-        cure = accepted_corrections(TrueMistake(kind, size, size, size), truths[0])[0][0]
+        cure = accepted_corrections(InjectedFault(kind, size, size, size), truths[0])[0][0]
         for from_s in (None, float(np.median(begins))):
-            claim = StudentMistake(
+            claim = NamedFault(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
                 parameter=cure, panel=panels_showing(kind)[0],
             )  # fmt: skip
@@ -123,7 +123,7 @@ def right(one: FormTruth) -> Answers:
         value = None if np.isinf(low) else value
         whole = wrong.from_s is None and wrong.until_s is None
         claims.append(
-            StudentMistake(
+            NamedFault(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
                 panel=panels_showing(wrong.kind)[0],
@@ -131,7 +131,7 @@ def right(one: FormTruth) -> Answers:
         )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
-        mistakes=tuple(claims) or (StudentMistake("none"),),
+        mistakes=tuple(claims) or (NamedFault("none"),),
         verdict_kf=one.kf.verdict,  # type: ignore[arg-type]
         verdict_ekf2=one.ekf2.verdict or NOT_AVAILABLE,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
@@ -147,7 +147,7 @@ def main() -> None:
     with ProcessPoolExecutor() as pool:
         truths = list(pool.map(truth, range(given.students), chunksize=5))
     rng = np.random.default_rng(1)
-    none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
+    none = Answers(log_sha256=SHA256, mistakes=(NamedFault("none"),))
     loops = [one for one in truths if one.sigma_z_m < 0.05]
     aisles = [one for one in truths if one.sigma_z_m >= 0.05]
     print(f"{len(aisles)} aisles, {len(loops)} loops")

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.figures import draw_choices, draw_figures
+from px4fuse.classroom.assignment.figures import draw_figures, select_choices
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key
 from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
+    assign_random_flight,
     derive_key,
-    draw,
-    draw_uniform,
+    random_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
 from px4fuse.classroom.assignment.truth import form_truth
@@ -27,7 +27,7 @@ from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse_mistakes
 
-# True values of the simulation that the answer key lists
+# True values of the simulation in the answer key
 TRUE_VALUE_NAMES = (
     "duration_s",
     "sigma_z_m",
@@ -42,15 +42,15 @@ TRUE_VALUE_NAMES = (
 def simulate_assigned_flight(
     secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, RightAnswers]:
-    """Simulate the flight of one student, and return the log (ULog) with the right answers."""
-    assigned_flight = draw(secret, student.student_id, kind, count, truth)
+    """Simulate the flight of one student; return the log (ULog) and the right answers."""
+    assigned_flight = assign_random_flight(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(
         assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]
-    choices = draw_choices(partial(draw_uniform, secret, student.student_id, kind))
+    choices = select_choices(partial(random_uniform, secret, student.student_id, kind))
     form = replace(form_truth(simulation, sha256), choices=choices)
     return log, RightAnswers(
         student_id=student.student_id,
@@ -59,7 +59,7 @@ def simulate_assigned_flight(
         sha256=sha256,
         scenario=to_json_types(asdict(assigned_flight.scenario)),
         mistakes=assigned_flight.mistake_options,
-        truth={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
+        true_values={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
         difficulty=assigned_flight.difficulty,
         form=form,
     )
@@ -95,14 +95,14 @@ def assign(
 ) -> tuple[AnswerKey, int]:
     """Write log, answer form and figures of each student to a folder, and the answer key.
 
-    Students can be added to an existing key. Existing files are not replaced: they must be equal.
+    Students can be added to an existing key. Existing files must have the same content.
 
     Parameters
     ----------
     secret : bytes or None
         None for the secret in the existing key, or for a new random secret.
     count, truth
-        See :func:`~px4fuse.classroom.assignment.random_assignment.draw`.
+        See :func:`~px4fuse.classroom.assignment.random_assignment.assign_random_flight`.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def assign(
     with inputs_not_registered():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
-    # some students may have left the class, but a key with none of them is of another class
+    # some students may have left the class; a key without any of the students is of another class
     is_same_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )
@@ -147,8 +147,8 @@ def assign(
         }
         figures_file = folder / Path(student.file).with_suffix(".png")
         if not figures_file.exists():
-            draw_number = partial(draw_uniform, secret, student.student_id, kind)
-            missing_content_by_path[figures_file] = draw_figures(draw_number)
+            random_number = partial(random_uniform, secret, student.student_id, kind)
+            missing_content_by_path[figures_file] = draw_figures(random_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the answer key is written before the log, because an interrupted run needs its secret
         write_all({key_file: key_text(key).encode()})

@@ -1,7 +1,6 @@
 """Figures of further simulated flights, about which the answer form asks questions.
 
-A student gets the plots of these flights, but not their logs. Therefore px4fuse cannot analyse
-these flights, and its functions do not help to answer the questions.
+The student does not get the logs of these flights, so that px4fuse cannot answer the questions.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -10,7 +9,7 @@ from io import BytesIO
 import pandas as pd
 
 from px4fuse.card.model import FILTER_NAMES
-from px4fuse.classroom.assignment.random_assignment import draw_numbers
+from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
@@ -23,11 +22,11 @@ from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
-# Number of passes along the aisle of a flight in a figure
+# Number of passes along the aisle in the flight of a figure
 PASSES = 4
-# Minimum speed (m/s) along the aisle of the times with a grey background
+# The background of the plots is grey while the speed (m/s) along the aisle is above this value
 MIN_GREY_SPEED_M_S = 0.2
-# Questions about each figure, by the field of FigureFault that contains the right answer
+# Questions about each figure, by the field of FigureFault with the right answer
 QUESTIONS = {
     "fault": "injected fault",
     "evidence": "plots that show the fault, and that do not show it",
@@ -54,45 +53,45 @@ class FigureFault(Record):
 FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
-def _shuffle(names: Iterable[str], label: str, draw_number: Callable[[str], float]) -> list[str]:
-    return sorted(names, key=lambda name: draw_number(f"{label} {name}"))
+def _shuffle(names: Iterable[str], label: str, random_number: Callable[[str], float]) -> list[str]:
+    return sorted(names, key=lambda name: random_number(f"{label} {name}"))
 
 
-def _draw_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
-    """Draw the fault of each figure, by the title of the figure."""
-    kinds = _shuffle(FAULTS, "figures", draw_number)[:FIGURE_COUNT]
+def _select_kinds(random_number: Callable[[str], float]) -> dict[str, str]:
+    """Select the fault of each figure at random; return its kind by title of the figure."""
+    kinds = _shuffle(FAULTS, "figures", random_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
 
 
-def draw_choices(
-    draw_number: Callable[[str], float],
+def select_choices(
+    random_number: Callable[[str], float],
 ) -> tuple[tuple[Choice, ChoiceName], ...]:
-    """Draw the questions about the figures, with the letters of the right answers.
+    """Select the answers to the questions about the figures; return the right letters, too.
 
-    ``draw_number`` returns a random number in [0, 1) for a label.
+    ``random_number`` returns the random number in [0, 1) that belongs to a label.
     """
     choices = []
-    for title, kind in _draw_kinds(draw_number).items():
-        other_kinds = _shuffle(FAULTS.keys() - {kind}, f"{title} other", draw_number)
+    for title, kind in _select_kinds(random_number).items():
+        other_kinds = _shuffle(FAULTS.keys() - {kind}, f"{title} other", random_number)
         kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
         for field, question in QUESTIONS.items():
-            shuffled_kinds = _shuffle(kinds, f"{title} {field}", draw_number)
+            shuffled_kinds = _shuffle(kinds, f"{title} {field}", random_number)
             options = tuple(getattr(FAULTS[each], field) for each in shuffled_kinds)
             right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), right_letter))
     return tuple(choices)
 
 
-def draw_figures(draw_number: Callable[[str], float]) -> bytes:
-    """Simulate and analyse the flights of the figures, and draw them as a PNG file."""
+def draw_figures(random_number: Callable[[str], float]) -> bytes:
+    """Simulate and analyse the flights of the figures; return the plots as a PNG file."""
     comparisons = {}
-    for title, kind in _draw_kinds(draw_number).items():
+    for title, kind in _select_kinds(random_number).items():
 
-        def draw_own_number(label: str, title: str = title) -> float:
-            return draw_number(f"{title} {label}")
+        def figure_random_number(label: str, title: str = title) -> float:
+            return random_number(f"{title} {label}")
 
-        numbers = draw_numbers("aisle", draw_own_number)
-        seed = int(2**53 * draw_own_number("seed"))
+        numbers = random_scenario_numbers("aisle", figure_random_number)
+        seed = int(2**53 * figure_random_number("seed"))
         scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
         mistakes = parse_mistakes(tuple(filter(None, [FAULTS[kind].option])))
         comparisons[title] = compare_simulation(flights.simulate(scenario, mistakes))
@@ -100,10 +99,10 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
 
 
 def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
-    """Draw innovations, position errors and map of each flight in a row, by title."""
+    """Plot innovations, position errors and map of each flight in one row."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - slow import
 
-    content = BytesIO()
+    png_buffer = BytesIO()
     with style.report_style():
         picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
         rows = picture.subplots(len(comparisons), 4, squeeze=False)
@@ -116,12 +115,12 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
             for axis in axes[:3]:
                 style.label_time_axis(axis, with_time_label=True)
             _draw_map(axes[3], comparison)
-        picture.savefig(content, format="png", dpi=90, metadata={"Software": None})
-    return content.getvalue()
+        picture.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
+    return png_buffer.getvalue()
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Draw the position errors of a filter with ±2σ; times of flight along the axis are grey."""
+    """Plot the position error of a filter with ±2σ, grey while the vehicle flies down the aisle."""
     name, errors, truth = (
         FILTER_NAMES[filter_name],
         position_errors(result, filter_name),

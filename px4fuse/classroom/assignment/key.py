@@ -1,4 +1,4 @@
-"""Answer key of an assignment: flight, injected faults and right answers for each student."""
+"""Answer key of an assignment: flight, injected faults and right answers of each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +12,7 @@ from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import update_renamed_values
 
-# Maximum size (bytes) of an answer key: the key of 1000 students has two million bytes
+# Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 KEY_NOTE = (
     "For the instructor only: this file lists the injected faults of every student's flight. Do "
@@ -25,7 +25,9 @@ _Texts = Annotated[
 ]
 
 
-class RightAnswers(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
+class RightAnswers(
+    msgspec.Struct, frozen=True, rename={"student_id": "id", "true_values": "truth"}
+):
     """Assigned flight of one student, with its injected faults and the right answers.
 
     Attributes
@@ -36,8 +38,8 @@ class RightAnswers(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         Fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
         Values of ``px4fuse simulate --mistake``; empty for a flight without an injected fault.
-    truth : dict
-        True values of the simulation that the log does not contain, for example ``sigma_z_m``.
+    true_values : dict
+        Values of the simulation that the log does not contain, for example ``sigma_z_m``.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -46,7 +48,7 @@ class RightAnswers(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     scenario: dict[str, str | int | float | bool | None] = {}
     mistakes: _Texts = ()
-    truth: dict[str, _Number] = {}
+    true_values: dict[str, _Number] = {}
     difficulty: _Number | None = None
     form: FormTruth | None = None
 
@@ -59,8 +61,8 @@ class _Schema(msgspec.Struct, frozen=True):
 class AnswerKey(msgspec.Struct, frozen=True):
     """Right answers for all students of a class, as a JSON file.
 
-    ``kind`` is "aisle", "loop" or "mixed". ``secret`` is the random secret that determined the
-    flights, or "" if the instructor chose the secret.
+    ``kind`` is "aisle", "loop" or "mixed". ``secret`` is the random secret that determines the
+    flights; "" if the instructor chose a secret, which is then not stored.
     """
 
     kind: _Text
@@ -71,7 +73,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     schema: _Schema = _Schema()
     note: str = KEY_NOTE
 
-    def __repr__(self) -> str:  # without the secret, which an error message must not show
+    def __repr__(self) -> str:  # an error message must not show the secret
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> RightAnswers | None:

@@ -1,7 +1,7 @@
 """Random assignment of a flight with injected faults to each student.
 
-Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. The
-numbers cannot be predicted without the secret, and a second run gives the same flights.
+Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key.
+Students cannot predict them without the secret, and a second run gives the same flights.
 """
 
 from __future__ import annotations
@@ -21,45 +21,43 @@ from px4fuse.core.record import Record, read_toml
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
-# Kind of the flights of a class; for "mixed", aisle or loop is drawn for each student
+# Kind of the flights of a class; for "mixed", each student gets an aisle or a loop at random
 FlightKind = Literal["aisle", "loop", "mixed"]
 
-# Minimum length (characters) of the instructor's secret: a shorter one can be guessed
+# Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
-# First part of each HMAC message. Another label would change all flights, so that students could
-# not be added to existing answer keys
-DRAW_LABEL = "px4fuse assignment 2"
-# Fractions of flights with 0, 1 and 2 injected faults, by kind of flight. The only
-# possible injected fault of a loop is "open-end". Many loops have no injected fault, so that
-# students cannot guess "open-end"
-MISTAKE_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
+# First part of each HMAC message. Another label would change the flights of existing answer keys
+HMAC_LABEL = "px4fuse assignment 2"
+# Fractions of flights with 0, 1 and 2 injected faults, by kind of flight. Many loops have no
+# injected fault, so that students cannot guess "open-end", the only possible fault of a loop
+FAULT_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
 }
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
-# Range of the difficulty of an injected fault: smallest size that px4fuse detects, divided by the
-# size in the flight
+# Range of the difficulty of an injected fault: smallest detectable size, divided by the size in
+# the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Fraction of the flights whose faults are smaller than those that px4fuse detects, so that its
-# findings are not the right answers, and the largest difficulty of these flights
+# Fraction of the flights with faults that are too small for detection by px4fuse, so that students
+# cannot copy its findings, and the maximum difficulty of these faults
 UNDETECTABLE_FRACTION, UNDETECTABLE_DIFFICULTY = 0.25, 1.5
 
 
-class AssignableMistake(Record):
+class AssignableFault(Record):
     """Injected fault of a simulated flight that can be assigned to a student.
 
     Attributes
     ----------
     group : str
-        Two faults of one group are not assigned together, because one hides the other.
+        A flight has at most one fault of a group, because one fault would hide the other.
     detectable_size : float or None
         Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
         (tests/studies/rates.csv); None for a fault without a size.
     is_smaller_easier : bool
         True if a smaller number is easier to detect.
     has_either_sign : bool
-        True if the sign of the size is drawn at random.
+        True if the sign of the size is random.
     start_range_s : (float, float) or None
         Earliest and latest start (s); None for a fault that lasts the whole flight.
     hidden_groups : tuple of str
@@ -75,10 +73,10 @@ class AssignableMistake(Record):
     start_range_s: tuple[float, float] | None = None
     hidden_groups: tuple[str, ...] = ()
 
-    def is_detectable_with(self, other_mistake: AssignableMistake) -> bool:
+    def is_detectable_with(self, other_fault: AssignableFault) -> bool:
         """Return True if both injected faults can be detected in the same flight."""
-        is_hidden = other_mistake.group in (self.group, *self.hidden_groups)
-        return not is_hidden and self.group not in other_mistake.hidden_groups
+        is_hidden = other_fault.group in (self.group, *self.hidden_groups)
+        return not is_hidden and self.group not in other_fault.hidden_groups
 
     def format_option(
         self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5
@@ -99,17 +97,17 @@ class AssignableMistake(Record):
         return f"{text},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
 
 
-class DrawingRules(Record):
-    """Possible injected faults of a kind of flight, and ranges of random numbers (``drawn.toml``).
+class SamplingRules(Record):
+    """Injected faults that a kind of flight can have, and ranges of its random numbers.
 
-    ``numbers`` are minimum, maximum and decimals, by field of the scenario.
+    ``numbers`` are minimum, maximum and number of decimals of each random field of the scenario.
     """
 
-    mistakes: tuple[AssignableMistake, ...]
+    mistakes: tuple[AssignableFault, ...]
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, DrawingRules], "drawn.toml")
+RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, SamplingRules], "drawn.toml")
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,8 @@ class AssignedFlight:
     mistake_options : tuple of str
         Values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Difficulty of the most difficult injected fault; HARDEST_DIFFICULTY without a fault.
-        Above HARDEST_DIFFICULTY, px4fuse may not detect the fault.
+        Largest ratio of the smallest detectable size of an injected fault to its size in the
+        flight; 1 without a fault. px4fuse may not detect a fault with a ratio above 1.
     """
 
     scenario: Scenario
@@ -132,33 +130,33 @@ class AssignedFlight:
     difficulty: float
 
 
-def draw_bits(secret: bytes, student_id: str, kind: FlightKind, label: str) -> int:
-    """Return a random number of 128 bits that secret, student, kind and label determine."""
-    message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
+def random_bits(secret: bytes, student_id: str, kind: FlightKind, label: str) -> int:
+    """Return the random integer (128 bits) of a student for a label."""
+    message = "\0".join((HMAC_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:16], "big")
 
 
-def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
-    """Return a random number in [0, 1), the first 53 bits of :func:`draw_bits`."""
-    return (draw_bits(secret, student_id, kind, label) >> 75) / 2**53
+def random_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
+    """Return the random number in [0, 1) of a student for a label."""
+    return (random_bits(secret, student_id, kind, label) >> 75) / 2**53
 
 
-def draw(
+def assign_random_flight(
     secret: bytes,
     student_id: str,
     kind: FlightKind,
-    mistake_count: int | None = None,
+    fault_count: int | None = None,
     truth: bool = True,
 ) -> AssignedFlight:
-    """Draw the flight of one student.
+    """Select injected faults and scenario of one student's flight at random.
 
     Parameters
     ----------
     kind : {"aisle", "loop", "mixed"}
-        "mixed" draws aisle or loop.
-    mistake_count : int, optional
-        Number of injected faults; drawn at random by default.
+        "mixed" selects aisle or loop at random.
+    fault_count : int, optional
+        Number of injected faults; random by default.
     truth : bool
         True to log the ground truth of aisle flights. The log of a loop never contains it, because
         the ground truth shows the landing place.
@@ -168,52 +166,56 @@ def draw(
     SettingsError
         One flight cannot have this many injected faults.
     """
-    possible_kinds = MISTAKE_COUNT_FRACTIONS if kind == "mixed" else (kind,)
-    max_mistake_count = (
-        min(len(MISTAKE_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
+    possible_kinds = FAULT_COUNT_FRACTIONS if kind == "mixed" else (kind,)
+    max_fault_count = (
+        min(len(FAULT_COUNT_FRACTIONS[scenario_kind]) for scenario_kind in possible_kinds) - 1
     )
-    if mistake_count is not None and not 0 <= mistake_count <= max_mistake_count:
+    if fault_count is not None and not 0 <= fault_count <= max_fault_count:
         raise SettingsError(
-            f"--mistakes {mistake_count} is out of range: a flight of kind {kind} has 0 to "
-            f"{max_mistake_count} detectable mistakes."
+            f"--mistakes {fault_count} is out of range: a flight of kind {kind} has 0 to "
+            f"{max_fault_count} faults."
         )
     if kind == "mixed":
-        kind = "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
-    draw_number = partial(draw_uniform, secret, student_id, kind)
-    if mistake_count is None:
-        mistake_count = bisect(
-            list(accumulate(MISTAKE_COUNT_FRACTIONS[kind][:-1])), draw_number("count")
+        kind = (
+            "loop" if random_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
         )
-    mistakes: list[AssignableMistake] = []
+    random_number = partial(random_uniform, secret, student_id, kind)
+    if fault_count is None:
+        fault_count = bisect(
+            list(accumulate(FAULT_COUNT_FRACTIONS[kind][:-1])), random_number("count")
+        )
+    faults: list[AssignableFault] = []
     rules = RULES_BY_KIND[kind]
-    for mistake in sorted(rules.mistakes, key=lambda each: draw_number(f"order {each.mistake}")):
-        if len(mistakes) < mistake_count and all(map(mistake.is_detectable_with, mistakes)):
-            mistakes.append(mistake)
+    for fault in sorted(rules.mistakes, key=lambda each: random_number(f"order {each.mistake}")):
+        if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
+            faults.append(fault)
     low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
-    if draw_number("undetectable") < UNDETECTABLE_FRACTION:
+    if random_number("undetectable") < UNDETECTABLE_FRACTION:
         low, high = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
-    difficulties, options = [], []
-    for mistake in mistakes:
-        name, difficulty = mistake.mistake, EASIEST_DIFFICULTY
-        if mistake.detectable_size is not None:
-            difficulty = low + (high - low) * draw_number(f"size {name}")
-        sign = -1.0 if mistake.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
+    difficulties, mistake_options = [], []
+    for fault in faults:
+        name, difficulty = fault.mistake, EASIEST_DIFFICULTY
+        if fault.detectable_size is not None:
+            difficulty = low + (high - low) * random_number(f"size {name}")
+        sign = -1.0 if fault.has_either_sign and random_number(f"sign {name}") < 0.5 else 1.0
         difficulties.append(difficulty)
-        options.append(mistake.format_option(difficulty, sign, draw_number(f"at {name}")))
+        mistake_options.append(fault.format_option(difficulty, sign, random_number(f"at {name}")))
     scenario = make_scenario(
         kind,
         truth=truth and kind == "aisle",
-        seed=draw_bits(secret, student_id, kind, "seed"),
-        **draw_numbers(kind, draw_number),
+        seed=random_bits(secret, student_id, kind, "seed"),
+        **random_scenario_numbers(kind, random_number),
     )
     difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
-    return AssignedFlight(scenario, tuple(options), round(difficulty, 2))
+    return AssignedFlight(scenario, tuple(mistake_options), round(difficulty, 2))
 
 
-def draw_numbers(kind: ScenarioKind, draw_number: Callable[[str], float]) -> dict[str, Any]:
-    """Draw the numbers of a scenario of this kind, by field."""
+def random_scenario_numbers(
+    kind: ScenarioKind, random_number: Callable[[str], float]
+) -> dict[str, Any]:
+    """Return random values for the numeric fields of a scenario."""
     return {
-        name: round(low + (high - low) * draw_number(name), decimals)
+        name: round(low + (high - low) * random_number(name), decimals)
         for name, (low, high, decimals) in RULES_BY_KIND[kind].numbers.items()
     }
 
@@ -237,6 +239,6 @@ def encode_secret(text: str, source_name: str) -> bytes:
 
 
 def derive_key(secret: str) -> bytes:
-    """Derive the key of the random numbers by scrypt (RFC 7914), which makes guessing slow."""
+    """Derive the key of the random numbers by scrypt (RFC 7914), so that guessing is slow."""
     text = secret.encode(errors="replace")
-    return hashlib.scrypt(text, salt=DRAW_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)
+    return hashlib.scrypt(text, salt=HMAC_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

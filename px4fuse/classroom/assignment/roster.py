@@ -19,14 +19,14 @@ MAX_STUDENTS = 1000
 # Maximum length (characters) of a file name without suffix: systems allow 255 bytes, and a
 # character has up to 4 bytes
 MAX_STEM_LENGTH = 48
-# File names that Windows reserves
+# File names that Windows does not allow
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
 TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
-# Fields of a student that are copied from another list if the class list does not contain them
+# Fields of a student that are copied from other tables if the class list lacks them
 FIELDS_OF_OTHER_LISTS = ("name", "email", "login", "submission_time", "extended_due")
-# Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
+# Names of rows in Canvas gradebooks that are not students, as lower-case letters
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
 
@@ -34,9 +34,9 @@ NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 class Person:
     """Student of the class.
 
-    ``login`` is the login on Blackboard or ILIAS, ``numbers`` the student's number by learning
-    platform, ``submission_time`` the time in Moodle's worksheet, and ``extended_due`` the due time
-    of this student in the form of the option --due.
+    ``login`` is the login on Blackboard or ILIAS, and ``numbers`` the number of the student by
+    learning platform. ``submission_time`` is the time in Moodle's worksheet, and ``extended_due``
+    the extended due time of the student, both as text.
     """
 
     student_id: str
@@ -49,7 +49,7 @@ class Person:
 
     @property
     def file(self) -> str:
-        """File name of the student's assigned log, made from the id."""
+        """File name of the student's assigned log."""
         return f"{file_stem(self.student_id)}.ulg"
 
 
@@ -114,7 +114,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
-    """Return the student in a row of a class list; None if the row contains no student."""
+    """Return the student in a table row, or None."""
     cells = {
         field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
         for field_name, titles in TITLES_BY_FIELD.items()
@@ -143,7 +143,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
 
 
 class Register:
-    """Students of the class; data that the class list lacks are added from other lists."""
+    """Students of a class; fields that the class list lacks are filled from other tables."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
@@ -159,10 +159,10 @@ class Register:
                 self.people[student_index] = replace(student, numbers=numbers, **fields)
 
     def student_index(self, other: Person) -> int | None:
-        """Return the index of a person in the class; None if the person is not identified.
+        """Return the index of a person in the class; None for an unknown person.
 
         The first of these fields that matches exactly one student decides: platform number, id,
-        email, login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
+        email, login, name. Leading zeros of ids may be missing, because spreadsheets delete them.
         """
         match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
@@ -192,12 +192,12 @@ def normalise_text(text: str) -> str:
     return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
-def _is_same_text(stated_text: str, other_text: str) -> bool:
-    return normalise_text(stated_text) == normalise_text(other_text) != ""
+def _is_same_text(text: str, other_text: str) -> bool:
+    return normalise_text(text) == normalise_text(other_text) != ""
 
 
 def is_same_id(student_id: str, other_id: str) -> bool:
-    """Return True if two ids are equal except for case and leading zeros.
+    """Return True if two ids differ at most in case and leading zeros.
 
     >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
     (True, True, False)
@@ -206,7 +206,7 @@ def is_same_id(student_id: str, other_id: str) -> bool:
 
 
 def is_same_name(name: str, other_name: str) -> bool:
-    """Return True if two names have the same words in any order, or joined as Canvas joins them.
+    """Return True if two names have the same words in any order, or joined as in Canvas.
 
     >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
     (True, True)
@@ -247,16 +247,16 @@ def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
     ['notes', 'cover', 'Notes (2)']
     """
     unique_names: dict[str, str] = {}
-    repetition_count: Counter[str] = Counter()
+    repetition_counts: Counter[str] = Counter()
     for name in names:
         unique_name, normalised_name = name, name.casefold()
         while unique_name.casefold() in unique_names:
-            repetition_count[normalised_name] += 1
-            unique_name = pattern.format(name, repetition_count[normalised_name] + 1)
+            repetition_counts[normalised_name] += 1
+            unique_name = pattern.format(name, repetition_counts[normalised_name] + 1)
         unique_names[unique_name.casefold()] = unique_name
     return list(unique_names.values())
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
-    """Make file names that all systems allow and that differ in more than case."""
+    """Convert texts to unique file names that all systems allow."""
     return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

@@ -1,7 +1,7 @@
-"""CSV tables of learning platforms and instructors: reading, and writing of a changed copy.
+"""Reading and writing of CSV tables of learning platforms and instructors.
 
 The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
-separator. A copy has the encoding and the separator of the original.
+separator, and a changed copy keeps both.
 """
 
 import codecs
@@ -48,7 +48,6 @@ class Sheet:
         return csv_file.getvalue()
 
     def content(self) -> bytes:
-        """Encode the table in its original encoding."""
         try:
             return self.text.encode(self.encoding)
         except UnicodeEncodeError:  # Windows-1252 does not have all characters of a feedback text

@@ -29,7 +29,7 @@ from px4fuse.results.answer_form import (
     Choice,
     ChoiceName,
     FormQuestion,
-    draw_questions,
+    select_questions,
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
@@ -39,24 +39,24 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 SIZE_TOLERANCE = 0.15
 # Tolerance (m) of the loop closure error in a right answer
 CLOSURE_TOLERANCE_M = 0.3
-# Minimum fraction of samples rejected by EKF2 for which the student must name rejections
+# Minimum fraction of rejected positions for which the student must name rejections by EKF2
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of a position reset of EKF2 that the student must name
 MIN_RESET_M = 0.2
-# Time (s) from the start of the flight in which position resets are ignored: EKF2 resets to its
+# Time (s) after the start of the flight in which position resets do not count: EKF2 resets to the
 # first position
 IGNORED_RESETS_S = 5.0
 # Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
 BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
-class TrueMistake(Record):
-    """Injected fault of a simulated flight, with the limits of right answers.
+class InjectedFault(Record):
+    """Injected fault of a simulated flight, with the bounds of right answers.
 
     Attributes
     ----------
     size : float or None
-        Size in the first unit of the injected fault in ``form.toml``.
+        Size in the first unit of the fault in ``form.toml``.
     low, high : float or None
         Smallest and largest size that is a right answer.
     from_s, until_s : float or None
@@ -72,7 +72,7 @@ class TrueMistake(Record):
 
 
 class VerdictTruth(Record):
-    """Right verdict on the reported σ of a filter, and the factor by which σ is wrong.
+    """Right consistency verdict on a filter, and the factor by which its reported σ is wrong.
 
     ``verdict`` is "" if the flight has too few data for a verdict.
     """
@@ -93,13 +93,13 @@ class FormTruth(Record):
     ekf2_did_also : tuple of str
         Behaviours of EKF2 that the student may name without losing points.
     quantities : tuple
-        Answers to :func:`px4fuse.results.answer_form.draw_questions`; None if the flight is too
-        short.
+        Answers to the questions of :func:`~px4fuse.results.answer_form.select_questions`; None if
+        the flight is too short.
     choices : tuple
-        Questions about the figures, with the letter of the right answer.
+        Questions about the figures, each with the letter of the right answer.
     """
 
-    mistakes: tuple[TrueMistake, ...]
+    mistakes: tuple[InjectedFault, ...]
     sigma_z_m: float
     kf: VerdictTruth
     ekf2: VerdictTruth
@@ -114,7 +114,7 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     answer = flights.answer(simulation)
     comparison = compare_simulation(simulation)
     mistakes = tuple(
-        _true_mistake(name, values, answer["truth"], comparison)
+        _injected_fault(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
     )
     sigma_z_m = answer["truth"]["sigma_z_m"]
@@ -124,7 +124,9 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
         _verdict(comparison, "kf"),
         _verdict(comparison, "ekf2"),
         *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
-        tuple(quantity_truth(comparison.main, question) for question in draw_questions(log_sha256)),
+        tuple(
+            quantity_truth(comparison.main, question) for question in select_questions(log_sha256)
+        ),
     )
 
 
@@ -134,20 +136,20 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
     prepared = prepare(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
-        as_sent=True,  # assigned logs are analysed without corrections, too
+        as_sent=True,  # without corrections of frame and clock, as for the students' logs
     )
     return compare(prepared, run_kf(prepared))
 
 
-def _true_mistake(
+def _injected_fault(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
-) -> TrueMistake:
+) -> InjectedFault:
     sizes = SIMULATED_MISTAKES[name].size_fields
     if not sizes:
-        return TrueMistake(name)
+        return InjectedFault(name)
     size = values[sizes[0]]
     tolerance = SIZE_TOLERANCE * abs(size)
-    if name == "open-end":  # the student measures the closure error, which includes odometry drift
+    if name == "open-end":  # the student measures the closure error, which contains odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
         measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
@@ -167,7 +169,7 @@ def _true_mistake(
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
             from_s = values[sizes[1]]
             until_s = from_s + abs(size) if name.endswith("dropout") else None
-    return TrueMistake(name, size, low, high, from_s, until_s)
+    return InjectedFault(name, size, low, high, from_s, until_s)
 
 
 def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
@@ -180,9 +182,9 @@ def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
 
 
 def _ekf2_behaviour(
-    comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
+    comparison: Comparison, mistakes: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviours of EKF2 that the student must name, and others that are not wrong."""
+    """Return the behaviours of EKF2 that the student must name, and those that are allowed."""
     size_by_kind = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
         [
@@ -216,10 +218,10 @@ def _ekf2_behaviour(
 def quantity_truth(
     axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """Compute the right answer by a run of KF with the settings of the question.
+    """Compute the right answer to a question by a run of KF; None with too few measurements.
 
-    Returns None if the flight has too few measurements. For "prediction", the answer is the
-    position σ (m) after predictions with F and Q in steps of DT, without an update.
+    For the kind "prediction", the answer is the position σ (m) after predictions in steps of DT
+    without an update.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(axis_comparison.axis, settings)

@@ -1,4 +1,4 @@
-"""Checks that score a report. Each class is one check; its fields are the parameters of the check.
+"""Checks that score a report: one class per check, with the parameters of the check as fields.
 
 ``rubric.toml`` explains all checks for the instructor.
 """
@@ -37,7 +37,7 @@ from px4fuse.verification.verification import flatten, is_number, log_sha256
 MAX_QUOTE_LENGTH = 160
 OTHER_FORM_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
-# Regular expression of one character that is not a control character
+# Regular expression of one character, without control characters
 _PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
 Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*$")]
 Title = Annotated[
@@ -53,16 +53,16 @@ FractionAndReason = tuple[float, str]
 class RubricItem(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
 ):
-    """Item of the rubric, for which a report gets points; subclasses implement the checks.
+    """Item of the rubric for which a report gets points; each subclass is one check.
 
     Attributes
     ----------
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Reports to which the instructor restricts the item.
+        Kind of reports that get points for the item, by choice of the instructor.
     command : {"any", "compare", "loop"}
-        Reports that the check can score.
+        Kind of reports that the check can score.
     needs_key : bool
         True if the item is used only with an answer key.
     by_hand : bool
@@ -87,22 +87,25 @@ class RubricItem(
         return has_key and {self.report, self.command} <= {"any", command_name}
 
 
-def fraction_for_deviation(deviation_factor: float, factor: float) -> float:
+def fraction_for_deviation(deviation_factor: float, zero_points_factor: float) -> float:
     """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
-    The fraction decreases from 1 to 0 at ``factor``, linearly with the logarithm of the deviation.
+    The fraction decreases linearly with the logarithm of the deviation, to 0 at
+    ``zero_points_factor``.
 
     >>> [round(fraction_for_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if deviation_factor <= 1.0:
         return 1.0
-    return max(1.0 - math.log(deviation_factor) / math.log(factor), 0.0) if factor > 1.0 else 0.0
+    if deviation_factor >= zero_points_factor:
+        return 0.0
+    return 1.0 - math.log(deviation_factor) / math.log(zero_points_factor)
 
 
 @dataclass(frozen=True)
 class CheckInput:
-    """Data for scoring one report: results, verdict of the verification, and answer key.
+    """Data for scoring one report: results, result of the verification, and answer key.
 
     ``submitter_id`` is the student id according to the learning platform.
     """
@@ -124,14 +127,14 @@ class CheckInput:
 
     @cached_property
     def answer(self) -> RightAnswers | None:
-        """Right answers about the log of the report; None if the log was not assigned."""
+        """Right answers for the log of the report; None if the log was not assigned."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
     def assigned_answer(self) -> RightAnswers | None:
-        """Flight that was assigned to the student, according to the id on the learning platform.
+        """Right answers for the flight that was assigned to the student.
 
-        If the platform states no id, the id in the report is used.
+        The id on the learning platform identifies the student, or else the id in the report.
         """
         if self.key is None:
             return None
@@ -191,16 +194,16 @@ class CheckInput:
         return format_reason(BOTH_AXES_ADVICE) if HORIZONTAL in path else ""
 
 
-def find_values(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    """Return the paths in the results that match a pattern, with their values.
+def find_values(values: Mapping[str, Any], path_pattern: str) -> list[tuple[str, Any]]:
+    """Return the values of the results whose path matches a pattern, as (path, value).
 
     In the pattern, ``*`` matches any key, and quotes enclose a key that contains dots.
 
     >>> find_values({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
     [('a.b.c.0', 1)]
     """
-    pattern = re.compile(re.escape(path.replace('"', "")).replace(r"\*", "[^.]*"))
-    return [(name, value) for name, value in values.items() if pattern.fullmatch(name)]
+    regex = re.compile(re.escape(path_pattern.replace('"', "")).replace(r"\*", "[^.]*"))
+    return [(path, value) for path, value in values.items() if regex.fullmatch(path)]
 
 
 def shorten_text(value: str) -> str:
@@ -217,7 +220,7 @@ def format_reason(reason: str) -> str:
 
 
 class VerifiedItem(RubricItem, frozen=True, tag="verified"):
-    """Check that the numbers of the report agree with a new run of the analysis on its log."""
+    """Check that the numbers of the report agree with a re-run of the analysis on its log."""
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         verdict = check_input.verdict
@@ -320,16 +323,16 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 }
 
 
-class TuningItem(RubricItem, frozen=True, tag="tuning"):
-    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate.
+class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_factor": "factor"}):
+    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside the interval, the points decrease to zero at a deviation by ``factor``.
+    Outside the interval, the points decrease to zero at a ``zero_points_factor`` from its bound.
     """
 
     command: ClassVar[str] = "compare"
 
     setting: Sigma
-    factor: Factor = 2.0
+    zero_points_factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         comparison = check_input.comparison
@@ -344,22 +347,22 @@ class TuningItem(RubricItem, frozen=True, tag="tuning"):
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         low, high = interval
         if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
-            # the estimate is too small for a source that drifts, because innovations show no drift
+            # the estimate is too small, because the innovations do not show the drift of the source
             high = max(high, _largest_source_error_m(comparison))
         deviation = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
-        position, advice = "within", ""
+        relation, advice = "within", ""
         if deviation > 1.0:
             side = "above" if chosen_value > high else "below"
-            position = f"a factor of {format_factor(deviation)} {side}"
+            relation = f"a factor of {format_factor(deviation)} {side}"
             advice = f" Set {option} within this interval."
-        return fraction_for_deviation(deviation, self.factor), (
-            f"Your {label} {chosen_value:.3g} {unit} is {position} the 95 % interval of the "
+        return fraction_for_deviation(deviation, self.zero_points_factor), (
+            f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
             f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
         )
 
 
 def _largest_source_error_m(comparison: ComparisonResults) -> float:
-    """Return the largest position RMSE or loop closure error (m) of KF; 0 without both."""
+    """Return the error (m) of a source that drifts: position RMSE of KF, or loop closure error."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, Loop):
@@ -367,16 +370,18 @@ def _largest_source_error_m(comparison: ComparisonResults) -> float:
     return max(errors_m, default=0.0)
 
 
-class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
+class ConsistencyItem(
+    RubricItem, frozen=True, tag="consistent", rename={"zero_points_factor": "factor"}
+):
     """Check that KF is consistent, by the joint NIS of KF along north and east.
 
-    If KF is not consistent, the points decrease to zero at a σ that is wrong by ``factor``. They do
-    not decrease if both SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates.
+    Otherwise, the points decrease to zero at a σ that is wrong by ``zero_points_factor``, unless
+    both SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates.
     """
 
     command: ClassVar[str] = "compare"
 
-    factor: Factor = 2.0
+    zero_points_factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         nis_result = check_input.comparison.horizontal.get("kf")
@@ -387,7 +392,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
         factor = nis_result.sigma_error_factor
-        fraction = fraction_for_deviation(factor, self.factor)
+        fraction = fraction_for_deviation(factor, self.zero_points_factor)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."
@@ -436,8 +441,8 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
         if low - self.margin_s <= applied_s <= high + self.margin_s:
             return 1.0, statement
         if check_input.has_finding(*CHANGING_CLOCK_FINDINGS):
-            mistakes = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
-            if any(mistake.kind in ("clock-jump", "clock-drift") for mistake in mistakes):
+            faults = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
+            if any(fault.kind in ("clock-jump", "clock-drift") for fault in faults):
                 return 1.0, "The time offset changes during your flight, as your form states."
             return self.undeterminable, (
                 "The time offset changes during your flight. State the time of the change in your "
@@ -449,17 +454,17 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
 # ------------------------------------------------------------------ check of a loop
 
 
-# Maximum distance (m) between take-off and landing place of a closed loop
+# Maximum distance (m) between take-off and landing position of a closed loop
 MAX_LANDING_DISTANCE_M = 0.5
 CORRECTIONS: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
 
 
 class LoopItem(RubricItem, frozen=True, tag="loop"):
-    """Check a loop: a quarter of the points for a measured loop closure error.
+    """Score a loop: 1/4 of the points for a measured loop closure error.
 
-    A report with an accepted closure has half of the points, and with a corrected path all points.
-    If the vehicle did not land at the take-off place according to the answer key, a report without
-    an accepted closure gets all points.
+    A report gets 1/2 with an accepted loop closure, and all points with a corrected path. It also
+    gets all points without an accepted closure if the vehicle landed at another place according to
+    the answer key.
     """
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
@@ -467,7 +472,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
         answer = check_input.answer
-        landing_distance_m = answer.truth.get("closure_error_m", 0.0) if answer else 0.0
+        landing_distance_m = answer.true_values.get("closure_error_m", 0.0) if answer else 0.0
         if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
             return 1.0, (
                 f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
@@ -483,8 +488,8 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
         fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
-            paths = map(loop.corrections.get, CORRECTIONS)
-            is_corrected = any(isinstance(path, CorrectedPath) for path in paths)
+            corrected_paths = map(loop.corrections.get, CORRECTIONS)
+            is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
             fraction = 1.0 if is_corrected else 0.5
             comment = (
                 "A loop closure was accepted, and the path was "

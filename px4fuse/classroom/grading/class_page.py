@@ -1,7 +1,6 @@
 """Class page: a web page with statistics of the class, and a table with one row per student.
 
-Texts of students cannot act as HTML or scripts: see :mod:`px4fuse.html`. The page links to the
-redrawn PDFs in the folder ``reports/`` beside it.
+The page links to the redrawn PDFs in the folder ``reports/``.
 """
 
 import math
@@ -27,7 +26,7 @@ from px4fuse.results.answer_form import form_rows
 
 HISTOGRAM_BIN_COUNT = 10
 NO_SUBMISSION_STATUS = "no submission"
-# CSS style and symbol of each verification status, in the order in which the class table sorts them
+# CSS style and symbol of each verification status, in sort order
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
     "numbers differ": ("bad", "≠"),
@@ -71,7 +70,7 @@ def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str
 
 
 def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
-    """Format the HTML above the class table: reports by status, and distributions of points."""
+    """Format the HTML above the class table: number of reports by status, and point histograms."""
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
     reports = [report for entry in entries if (report := entry.counted_report)]
@@ -89,7 +88,7 @@ def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
-    """Count the values in each tenth of 0 to ``maximum``; return (count, lower edge) of each.
+    """Count the values in each tenth of 0 to ``maximum``; return a (count, lower edge) per tenth.
 
     >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
@@ -105,9 +104,7 @@ def _entry_tags(entry: Entry) -> list[str]:
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
-        tags += [
-            f"missed: {mistake}" for mistake, is_named in report.mistakes.items() if not is_named
-        ]
+        tags += [f"missed: {kind}" for kind, is_named in report.mistakes.items() if not is_named]
     return tags + ["changed by instructor"] * bool(entry.overrides or entry.comment)
 
 
@@ -131,7 +128,7 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
-    # overrides.csv identifies students by id or file; a row with pseudonym has neither
+    # a row with pseudonym has neither id nor file, by which overrides.csv identifies students
     point_boxes = (_point_boxes(entry),) if entry.student_id or file else ()
     # a row with pseudonym has no link, because the file name may contain the student's name
     links = (
@@ -146,7 +143,7 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
 
 
 def _entry_details(entry: Entry) -> Iterator[Section]:
-    """Yield the details of a student, which the class page shows on a click on the row."""
+    """Yield the details of a student, which the class page shows after a click on the row."""
     report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
         yield frame.list_section("Missing", ["No submission."])
@@ -166,9 +163,9 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
         )
         for item in report.items
     ]
-    mistake_texts = [
-        f"{name}: {'named' if is_named else 'not named'} in the answer form"
-        for name, is_named in report.mistakes.items()
+    fault_texts = [
+        f"{kind}: {'named' if is_named else 'not named'} in the answer form"
+        for kind, is_named in report.mistakes.items()
     ]
     attempts = [
         f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
@@ -183,7 +180,7 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     item_titles = ("Item", "Points", "Of", "Comment") if items else ()
     yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
-    yield frame.list_section("Injected faults of this flight", mistake_texts)
+    yield frame.list_section("Injected faults of this flight", fault_texts)
     yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
     yield frame.list_section("Other attempts", attempts)
@@ -207,7 +204,7 @@ def _points_cell(entry: Entry) -> Cell:
 
 
 def _point_boxes(entry: Entry) -> Section:
-    """Make input boxes for the rubric items that the instructor scores, and for the total."""
+    """Return input boxes for the rubric items that the instructor scores, and for the total."""
     report = entry.counted_report
     max_by_title = {
         item.title: item.max_points
@@ -220,7 +217,7 @@ def _point_boxes(entry: Entry) -> Section:
         (title, max_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
-    # the page writes a new overrides.csv, so it must also contain the rows without boxes
+    # the page writes a new overrides.csv, so it must also contain the overrides without boxes
     other_rows = [
         (title, override.points, override.comment)
         for title, override in entry.overrides.items()

@@ -38,7 +38,7 @@ OVERRIDE_TITLES = ("id", "item", "points", "comment")
 OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
 MAX_COMMENT_LENGTH = 10_000
 
-# Points or comment of the instructor, by student id and item title as typed ("": the whole report)
+# Points and comment of the instructor, by student id and item title ("": the whole report)
 Overrides = Mapping[str, Mapping[str, Override]]
 # Syntax of the option --late, for example "10 % / day up to 50 %"
 _LATE_RULE = re.compile(
@@ -47,7 +47,7 @@ _LATE_RULE = re.compile(
 )
 # Formats of submission times in Moodle's worksheets (English), with a 12-hour and a 24-hour clock
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
-# Beginnings of the German names of months in these times, January first
+# First letters of the German names of months, January first
 GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep", "okt", "nov", "dez")
 
 
@@ -84,7 +84,7 @@ class Course:
     logs : sequence of Path
         Flight logs, and folders of logs.
     roster : tuple of Person or None
-        Class list; by default the students of the answer key, else of the worksheets.
+        Class list; None for the students of the answer key, or else of the first worksheet.
     worksheets : tuple of Sheet
         Tables of learning platforms, into which the grades are entered.
     column : str
@@ -129,7 +129,7 @@ class Course:
         return Register(people, *people_by_sheet)
 
 
-# Sort key of a report (submission time, time of the zip entry), report, and row of the class table
+# Sort key of a report (UNIX times of submission and of the zip entry), report, and its table row
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -199,21 +199,21 @@ def build_entries(
 def _collect_students(
     reports: Sequence[GradedReport], submissions: Sequence[Submission]
 ) -> Register:
-    """Collect the students that learning platforms and reports name, if there is no class list."""
+    """Collect the students that learning platforms and reports name, without a class list."""
     register = Register()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        stated_index = register.student_index(Person(report.student_id))
+        reported_student_index = register.student_index(Person(report.student_id))
         if person.numbers or person.login:
             if register.student_index(person) is not None:
                 continue
-            # the id in the report is not used if another student has it already
-            free_id = report.student_id if stated_index is None else ""
+            # the id in the report is not used if another student has this id
+            free_id = report.student_id if reported_student_index is None else ""
             student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             register.people.append(replace(person, student_id=student_id, name=name))
-        elif report.student_id and stated_index is None:
+        elif report.student_id and reported_student_index is None:
             register.people.append(Person(report.student_id, one_line(report.student, 200)))
     return register
 
@@ -225,7 +225,7 @@ def _make_attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """Make a row of the class table as if this report were the only one of the student."""
+    """Make the row of the class table for a student with only this report."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
     due_time = course.due
@@ -257,12 +257,12 @@ def _make_attempt(
             "The student imitated the file name of a learning platform "
             f"(platform of the export: {platform or 'none'})."
         )
-    stated_index = register.student_index(Person(report.student_id)) if platform else None
-    if stated_index is not None and student_index not in (None, stated_index):
-        stated_person = register.people[stated_index]
+    reported_student_index = register.student_index(Person(report.student_id)) if platform else None
+    if reported_student_index is not None and student_index not in (None, reported_student_index):
+        reported_person = register.people[reported_student_index]
         flags.append(
-            f"The id in the report is that of {stated_person.student_id} "
-            f"({stated_person.name or 'no name'}), but {platform} names another student."
+            f"The id in the report is that of {reported_person.student_id} "
+            f"({reported_person.name or 'no name'}), but {platform} names another student."
         )
     late_rule = course.late_rule
     entry = Entry(
@@ -288,13 +288,13 @@ def _points_after_deduction(attempt: Attempt) -> float:
 
 
 def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
-    """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
-    # several reports of one submission have the same time; points are the second sort key
+    """Choose the report of a student that counts; add flags if the choice is ambiguous."""
+    # reports with the same time are sorted by points
     sorted_attempts = sorted(
         attempts,
         key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
     )
-    # reports that the instructor does not have to check are preferred, and then files with a report
+    # prefer reports that need no decision of the instructor, then readable reports, then the rest
     attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
     attempts_without_action = [
         attempt for attempt in attempts_with_report if not attempt[1].instructor_action
@@ -302,7 +302,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     eligible_attempts = attempts_without_action or attempts_with_report or sorted_attempts
     chosen_key, chosen_report, entry = {
         "latest": eligible_attempts[-1],
-        # if the first submission contains several reports, the report with most points is used
+        # the report with most points of the first submission
         "first": [
             attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
         ][-1],
@@ -311,7 +311,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     flags = list(entry.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
     forms = [report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_key]
-    # students must not hand in several forms with different guesses, of which the best would count
+    # otherwise students could hand in several forms with different guesses
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
@@ -364,7 +364,7 @@ def _apply_overrides(
 
 
 def _override_item(item: Item, override: Override | None) -> Item:
-    """Replace the points of a rubric item by the instructor's points, and append the comment."""
+    """Replace the points of a rubric item by those of the instructor, and append the comment."""
     if override is None:
         return item
     comment = item.comment

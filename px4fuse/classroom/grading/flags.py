@@ -1,7 +1,7 @@
 """Flags: sentences for the instructor about suspicious reports, without effect on points.
 
-A flag does not prove a copy: two students may fly together, and students who follow the advice of
-px4fuse get the same settings.
+A flag does not prove a copy: two students may have the same flight, and students who follow the
+advice of px4fuse get the same settings.
 """
 
 from collections import defaultdict
@@ -19,15 +19,15 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verification
 
-# Minimum number of equal numbers in two answer forms for flagging them as copies
+# Minimum number of equal numbers in two answer forms for a flag
 MIN_SAME_NUMBERS = 3
-# Minimum number of letters about figures for a comparison of the answers of two students
-MIN_SAME_LETTERS = 6
-# Maximum relative difference of two equal numbers: a copy may have small changes
+# Minimum number of answered figure questions for comparing the answers of two students
+MIN_ANSWERED_CHOICES = 6
+# Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
-# Minimum fraction of the log that --start and --end must include; otherwise a flag is raised
+# Minimum fraction of the log between --start and --end; less is flagged
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between --drift or --heading-drift and its default; otherwise a flag is raised
+# Maximum factor between --drift or --heading-drift and its default; more is flagged
 MAX_DRIFT_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents, for example the same answer form
@@ -35,20 +35,21 @@ Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
 def flag_pages(verdict: Verification) -> Iterator[str]:
-    """Yield a flag with the first difference if a PDF differs from the redrawn report."""
+    """Yield a flag with the first difference between a PDF and the redrawn report, if any."""
     if verdict.pages:
-        first_page, *further_pages = verdict.pages
-        more_text = f" The PDF has {len(further_pages)} more differences." if further_pages else ""
+        first_difference, *further_differences = verdict.pages
+        count = len(further_differences)
+        more_text = f" The PDF has {count} more differences." if count else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
-            f"{capitalise_first(first_page.sentence)}.{more_text} Read the redrawn report."
+            f"{capitalise_first(first_difference.sentence)}.{more_text} Read the redrawn report."
         )
 
 
 def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
     """Yield flags about unusual settings of one report.
 
-    ``has_key``: True if there is an answer key; a simulated log is then expected.
+    ``has_key`` is True with an answer key: simulated logs are then expected.
     """
     if isinstance(results, LoopResults):
         yield from _flag_drift(results.request)
@@ -78,9 +79,9 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
 
 
 def _flag_drift(request: LoopRequest) -> Iterator[str]:
-    """Yield flags about an odometry drift in the options that is far from the default.
+    """Yield flags about --drift and --heading-drift values that are far from the default.
 
-    The chi-square test of a loop closure uses this drift.
+    The chi-square test of a loop closure depends on these values.
     """
     defaults = LoopRequest(source="")
     for option, unit, drift, default in (
@@ -95,16 +96,16 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers in an answer form, by the name of the answer."""
+    """Return the numbers in an answer form by fault kind (or "") and field."""
     if report.form is None:
         return {}
     answers: dict[tuple[str, str], object] = {
-        (mistake.kind, name): getattr(mistake, name)
-        for mistake in report.form.mistakes
+        (fault.kind, name): getattr(fault, name)
+        for fault in report.form.mistakes
         for name in ("size", "value")
     }
     answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
-    # the digits of a list of update numbers are joined, so that equal lists are equal numbers
+    # the digits of a list of update numbers are joined to one number for the comparison
     answers |= {
         (f"q{index}", "value"): float("".join(f"{number:.0f}" for number in numbers))
         for index, numbers in enumerate(report.form.quantities)
@@ -114,9 +115,10 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two answer forms, without numbers of one digit.
+    """Count the equal numbers of two answer forms; numbers with one digit do not count.
 
-    Values of corrections and lists must be exactly equal, others within SAME_NUMBER_TOLERANCE.
+    Parameter values and lists of update numbers must be exactly equal, all other numbers within
+    SAME_NUMBER_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1
@@ -131,7 +133,7 @@ def _student_key(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# Checks for equal contents of two reports: text of the flag, functions that return the compared
+# Checks for equal contents of two reports: text of the flag, and functions that return the compared
 # content and the owner of a report. Reports of the same owner are not compared
 EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
@@ -160,7 +162,7 @@ EQUAL_CONTENT_CHECKS: tuple[
         "The answers about the figures are those of {}, whose figures differ.",
         lambda report: (
             report.form
-            and sum(map(bool, report.form.choices)) >= MIN_SAME_LETTERS
+            and sum(map(bool, report.form.choices)) >= MIN_ANSWERED_CHOICES
             and report.form.choices
         ),
         _student_key,

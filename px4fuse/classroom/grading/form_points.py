@@ -1,8 +1,8 @@
 """Points of a student's answer form (0 to 100), by comparison with the answer key.
 
-The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each fault
-that the form names and the flight does not have (a false fault) costs points. A fault that can be
-guessed without a measurement has points only with the correct size.
+The constants reproduce points that an instructor gave by hand. Guesses do not pay: each false fault
+(in the form, but not in the flight) costs points, and a fault that can be guessed without a
+measurement has points only with the correct size.
 """
 
 import math
@@ -13,27 +13,27 @@ from typing import NamedTuple
 
 import msgspec
 
-from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
+from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
-    MISTAKES,
-    NO_MISTAKE_KIND,
+    FAULT_KINDS,
+    NO_FAULT_KIND,
     NOT_AVAILABLE,
     Answers,
+    NamedFault,
     QuantityAnswer,
-    StudentMistake,
-    draw_questions,
+    select_questions,
 )
 
-# Fraction of the points for the diagnosis if the answer key has choices: a student can copy the
-# diagnosis from the output of px4fuse, but not the answers about the figures
-DIAGNOSIS_SHARE = 0.2
+# Fraction of the points for the questions about the flight if there are questions about figures:
+# px4fuse can answer only those about the flight
+FLIGHT_SHARE = 0.2
 # Points deducted for each false fault
-FALSE_MISTAKE_POINTS = 10.0
-# Minimum number of false faults in an answer form for which its right faults give no points
-MIN_FALSE_MISTAKES_WITHOUT_POINTS = 3
-# Fraction of the points if the answer form names another fault of the same group
+FALSE_FAULT_POINTS = 10.0
+# Minimum number of false faults for which the right faults in an answer form give no points
+MIN_FALSE_FAULTS_WITHOUT_POINTS = 3
+# Fraction of the points if the answer form names another fault of the same group (neighbours)
 SAME_GROUP_FRACTION = 0.4
 # Fraction of the points if the answer form names ekf2-noise instead of r-scale: both make R wrong
 NOISE_FOR_R_SCALE_FRACTION = 2.0 / 3.0
@@ -41,10 +41,10 @@ NOISE_FOR_R_SCALE_FRACTION = 2.0 / 3.0
 EFFECT_FRACTION = 0.15
 # Kinds of injected faults that can be guessed without a measurement
 GUESSABLE_KINDS = frozenset(("open-end",))
-# Relative error over which the points for the size of a guessable fault decrease from full to zero:
-# the sizes that are assigned to students differ little
+# Relative error outside the tolerance at which the size of a guessable fault gives no points: the
+# sizes that are assigned to students differ little
 GUESSABLE_SIZE_RANGE = 0.08
-ANY_BOUNDS = (-math.inf, math.inf)
+NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
 TIME_TOLERANCE_S = 2.0
 # Tolerance of the start and the end of an injected fault, as fraction of the time since the first
@@ -59,15 +59,15 @@ HALF_POINTS_SIZE_TOLERANCE = 0.4
 
 
 class _CorrectionRule(NamedTuple):
-    """Correction of injected faults, and the fraction of the points for naming it.
+    """Correction of injected faults, and the fraction of the points for naming it by fault kind.
 
-    ``right_values`` are the smallest and the largest right value of the parameter, or the name of
-    bounds that :func:`accepted_corrections` computes.
+    ``right_values`` are the smallest and the largest right value of the parameter, or a keyword of
+    :func:`accepted_corrections` for bounds that depend on the flight.
     """
 
     parameter: str
-    fraction_by_mistake: Mapping[str, float]
-    right_values: tuple[float, float] | str = ANY_BOUNDS
+    fraction_by_kind: Mapping[str, float]
+    right_values: tuple[float, float] | str = NO_BOUNDS
 
 
 POINTS_TABLE = read_toml(__file__, dict)
@@ -78,10 +78,10 @@ PART_NAMES = tuple(POINTS_TABLE["weights"])
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points for each part of an answer form ("mistakes", "sizes", ...).
+    """Points for each part of an answer form ("mistakes", "sizes", ...), and feedback.
 
-    ``feedback`` are clauses for the student. ``is_named_by_kind`` is True for each injected fault
-    of the flight that the form names.
+    ``feedback`` are clauses for the student. ``is_named_by_kind`` states for each injected fault of
+    the flight if the form names it.
     """
 
     points_by_part: Mapping[str, float]
@@ -97,78 +97,76 @@ class FormPoints:
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Compute the points of an answer form by comparison with the right answers."""
-    is_no_mistake_right = not truth.mistakes and answers.names_no_mistake
-    weights = POINTS_TABLE["weights_clean" if is_no_mistake_right else "weights"]
+    is_no_fault_right = not truth.mistakes and answers.names_no_fault
+    weights = POINTS_TABLE["weights_clean" if is_no_fault_right else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
-    matches, false_mistakes = _match_mistakes(answers, truth)
-    if truth.mistakes and len(false_mistakes) < MIN_FALSE_MISTAKES_WITHOUT_POINTS:
-        fractions |= _mistake_fractions(matches, truth)
+    matches, false_faults = _match_faults(answers, truth)
+    if truth.mistakes and len(false_faults) < MIN_FALSE_FAULTS_WITHOUT_POINTS:
+        fractions |= _fault_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
-    # half of the points for the verdicts on a flight with faults if no computed number is right,
-    # because most verdicts can be guessed
-    is_guess_possible = not quantities_fraction and not is_no_mistake_right
+    # the verdicts give half of their points if no computed number is right: verdicts can be guessed
+    is_guess_possible = not quantities_fraction and not is_no_fault_right
     fractions["verdicts"] = _verdicts_fraction(answers, truth) * (0.5 if is_guess_possible else 1.0)
     points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
-    if is_no_mistake_right:
+    if is_no_fault_right:
         points_by_part["mistakes"] = weights["mistakes"]
-    elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        # no injected fault of this flight has a size, so the part "mistakes" gets the points of
-        # "sizes" too
+    elif truth.mistakes and all(fault.size is None for fault in truth.mistakes):
+        # no fault of the flight has a size, so the points of "sizes" are added to "mistakes"
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
-    points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
+    points_by_part["mistakes"] -= FALSE_FAULT_POINTS * len(false_faults)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
     if truth.choices:
-        weights = {name: DIAGNOSIS_SHARE * points for name, points in weights.items()}
-        weights["figures"] = 100.0 * (1.0 - DIAGNOSIS_SHARE)
-        points_by_part = {name: DIAGNOSIS_SHARE * points for name, points in points_by_part.items()}
+        weights = {name: FLIGHT_SHARE * points for name, points in weights.items()}
+        weights["figures"] = 100.0 * (1.0 - FLIGHT_SHARE)
+        points_by_part = {name: FLIGHT_SHARE * points for name, points in points_by_part.items()}
         points_by_part["figures"] = weights["figures"] * _choices_fraction(answers, truth)
-    named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
-    is_named_by_kind = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
+    named_kinds = [named_fault.kind for named_fault in answers.mistakes]
+    is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in truth.mistakes}
     feedback = (
-        *_mistake_feedback(matches, false_mistakes, is_no_mistake_right),
+        *_fault_feedback(matches, false_faults, is_no_fault_right),
         *_answer_feedback(answers, truth),
     )
     return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
 
 
-# Injected fault, matching fault in the answer form (if any), and fraction of the points
-Match = tuple[TrueMistake, StudentMistake | None, float]
+# Injected fault, matching fault in the answer form (or None), and fraction of the points
+Match = tuple[InjectedFault, NamedFault | None, float]
 
 
-def _mistake_feedback(
-    matches: list[Match], false_mistakes: list[StudentMistake], is_no_mistake_right: bool
+def _fault_feedback(
+    matches: list[Match], false_faults: list[NamedFault], is_no_fault_right: bool
 ) -> Iterator[str]:
-    """Yield a clause for each right or missed injected fault, and one for all false faults."""
+    """Yield a clause for each injected fault, and one clause for all false faults."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * is_no_mistake_right}"
-    for mistake, student_mistake, _ in matches:
-        mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
-        right_answer = describe_right_answer(mistake)
-        if student_mistake is None:
-            yield f"you did not name {mistake_text}: {right_answer}"
-        elif student_mistake.kind != mistake.kind:
-            yield f"you named {student_mistake.kind} instead of {mistake_text}: {right_answer}"
+        yield f"your flight has no injected fault{', as your form states' * is_no_fault_right}"
+    for fault, named_fault, _ in matches:
+        fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
+        right_answer = describe_right_answer(fault)
+        if named_fault is None:
+            yield f"you did not name {fault_text}: {right_answer}"
+        elif named_fault.kind != fault.kind:
+            yield f"you named {named_fault.kind} instead of {fault_text}: {right_answer}"
         else:
-            yield f"you named {mistake.kind}, which is right: {right_answer}"
-    if false_mistakes:
-        kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
+            yield f"you named {fault.kind}, which is right: {right_answer}"
+    if false_faults:
+        kinds = ", ".join(named_fault.kind for named_fault in false_faults)
         yield f"you named faults that your flight does not have: {kinds}"
 
 
-def describe_right_answer(mistake: TrueMistake) -> str:
-    """State the accepted size, the time and the panels of the report that show the fault."""
+def describe_right_answer(fault: InjectedFault) -> str:
+    """State accepted size and time of a fault, and the report panels that show the fault."""
     texts = []
-    if mistake.low is not None and mistake.high is not None:
-        unit = next(iter(MISTAKES[mistake.kind].units), "")
-        texts.append(f"accepted size {mistake.low:.3g} to {mistake.high:.3g} {unit}".rstrip())
-    start_text = "" if mistake.from_s is None else f"from {mistake.from_s:.0f} s "
-    end_text = "" if mistake.until_s is None else f"until {mistake.until_s:.0f} s"
+    if fault.low is not None and fault.high is not None:
+        unit = next(iter(FAULT_KINDS[fault.kind].units), "")
+        texts.append(f"accepted size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
+    start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
+    end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
-    return ", ".join([*texts, f"shown in {' or '.join(panels_showing(mistake.kind))}"])
+    return ", ".join([*texts, f"shown in {' or '.join(panels_showing(fault.kind))}"])
 
 
 def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
-    """Yield a clause with the right answer to each further question that is not answered right."""
+    """Yield the right answer to each question with a wrong answer, except those on faults."""
     rows: list[tuple[str, object, object]] = [
         ("verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
         ("verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
@@ -176,7 +174,7 @@ def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
     if _ekf2_behaviour_fraction(answers, truth) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, truth.ekf2_did))
     for question, given, right in zip_longest(
-        draw_questions(answers.log_sha256), answers.quantities, truth.quantities
+        select_questions(answers.log_sha256), answers.quantities, truth.quantities
     ):
         if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
             rows.append(
@@ -198,31 +196,26 @@ def _format_answer(answer: object) -> str:
     return f"{answer:.4g}" if isinstance(answer, float | int) else f"'{answer or 'none'}'"
 
 
-def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
+def _match_faults(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[NamedFault]]:
     """Match each injected fault with the fault in the form that gives the most points.
 
-    Also return the false faults: those in the form that match no injected fault.
+    Also return the faults in the form that match no injected fault.
     """
     unmatched = [
-        student_mistake
-        for student_mistake in answers.mistakes
-        if student_mistake.kind != NO_MISTAKE_KIND
+        named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND
     ]
-    match_by_kind: dict[str, tuple[StudentMistake, float]] = {}
+    match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     pairs = [
-        (fraction_for_named_kind(mistake.kind, student_mistake.kind), mistake.kind, student_mistake)
-        for mistake in truth.mistakes
-        for student_mistake in unmatched
+        (fraction_for_named_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
+        for fault in truth.mistakes
+        for named_fault in unmatched
     ]
-    for fraction, kind, student_mistake in sorted(pairs, key=lambda pair: -pair[0]):
-        if fraction and kind not in match_by_kind and student_mistake in unmatched:
-            match_by_kind[kind] = student_mistake, fraction
-            unmatched.remove(student_mistake)
+    for fraction, kind, named_fault in sorted(pairs, key=lambda pair: -pair[0]):
+        if fraction and kind not in match_by_kind and named_fault in unmatched:
+            match_by_kind[kind] = named_fault, fraction
+            unmatched.remove(named_fault)
     no_match = (None, 0.0)
-    matches = [
-        (true_mistake, *match_by_kind.get(true_mistake.kind, no_match))
-        for true_mistake in truth.mistakes
-    ]
+    matches = [(fault, *match_by_kind.get(fault.kind, no_match)) for fault in truth.mistakes]
     return matches, unmatched
 
 
@@ -237,77 +230,74 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
     return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
-def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points of the parts about faults, as means over all faults."""
-    mistake_with_size_count = sum(mistake.size is not None for mistake, _, _ in matches)
+def _fault_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
+    """Return the mean score (0 to 1) over all injected faults, by part of the form."""
+    sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
-    for mistake, student_mistake, fraction in matches:
-        if student_mistake is None:
+    for fault, named_fault, fraction in matches:
+        if named_fault is None:
             continue
-        size_points = size_fraction(mistake, student_mistake)
-        weight = (size_points if mistake.kind in GUESSABLE_KINDS else 1.0) / len(matches)
-        time_weight = weight if student_mistake.kind == mistake.kind else 0.5 * weight
+        size_points = size_fraction(fault, named_fault)
+        weight = (size_points if fault.kind in GUESSABLE_KINDS else 1.0) / len(matches)
+        time_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
         fractions["mistakes"] += fraction / len(matches)
-        fractions["time and panel"] += (
-            time_and_panel_fraction(mistake, student_mistake) * time_weight
-        )
-        fractions["correction"] += correction_fraction(mistake, student_mistake, truth) * weight
-        fractions["sizes"] += size_points / max(mistake_with_size_count, 1)
+        fractions["time and panel"] += time_and_panel_fraction(fault, named_fault) * time_weight
+        fractions["correction"] += correction_fraction(fault, named_fault, truth) * weight
+        fractions["sizes"] += size_points / max(sized_fault_count, 1)
     return fractions
 
 
-def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
+def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return the fraction of the points for the size of a fault.
 
-    The fraction is 1 within the tolerance and 1/2 near it. It is 1/3 for a wrong sign, and if the
-    form names another fault with this size.
+    The fraction is 1 within the tolerance, 1/2 near the tolerance, and 1/3 for a wrong sign or a
+    right size of another fault.
     """
-    named_size = student_mistake.size_in_first_unit()
-    if mistake.size is None or mistake.low is None or mistake.high is None or named_size is None:
+    named_size = named_fault.size_in_first_unit()
+    if fault.size is None or fault.low is None or fault.high is None or named_size is None:
         return 0.0
-    if student_mistake.kind != mistake.kind:
-        first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
-        is_right = mistake.low <= named_size <= mistake.high and first_units[0] == first_units[1]
+    if named_fault.kind != fault.kind:
+        first_units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
+        is_right = fault.low <= named_size <= fault.high and first_units[0] == first_units[1]
         return is_right / 3.0
-    deviation = abs(named_size - mistake.size) / abs(mistake.size)
+    deviation = abs(named_size - fault.size) / abs(fault.size)
     close_fraction = 0.5 * (deviation <= HALF_POINTS_SIZE_TOLERANCE)
-    if mistake.kind in GUESSABLE_KINDS:
-        tolerance = (mistake.high - mistake.low) / (2.0 * abs(mistake.size))
+    if fault.kind in GUESSABLE_KINDS:
+        tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
         close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
-    return _value_fraction(named_size, mistake.low, mistake.high, close_fraction)
+    return _value_fraction(named_size, fault.low, fault.high, close_fraction)
 
 
-def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
-    """Return the fraction of the points for time and report panel of a fault: half for each."""
-    if mistake.from_s is None and mistake.until_s is None:
-        is_time_right = student_mistake.when == "whole flight"
+def time_and_panel_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
+    """Return the fraction of the points for a fault: 1/2 for the time, 1/2 for the report panel."""
+    if fault.from_s is None and fault.until_s is None:
+        is_time_right = named_fault.when == "whole flight"
     else:
-        times = (mistake.from_s, student_mistake.from_s), (mistake.until_s, student_mistake.until_s)
-        is_time_right = not student_mistake.when and all(
+        times = (fault.from_s, named_fault.from_s), (fault.until_s, named_fault.until_s)
+        is_time_right = not named_fault.when and all(
             named_s is not None
             and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
             for true_s, named_s in times
             if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (student_mistake.panel in panels_showing(mistake.kind))
+    return 0.5 * is_time_right + 0.5 * (named_fault.panel in panels_showing(fault.kind))
 
 
-def panels_showing(kind: str) -> list[str]:
-    return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
+def panels_showing(fault_kind: str) -> list[str]:
+    shows = POINTS_TABLE["shows"].items()
+    return [*(panel for panel, kinds in shows if fault_kind in kinds), "cover"]
 
 
-def correction_fraction(
-    mistake: TrueMistake, student_mistake: StudentMistake, truth: FormTruth
-) -> float:
-    """Return the fraction of the points for a named correction and the value given with it."""
-    named_value = student_mistake.value_in_first_unit()
+def correction_fraction(fault: InjectedFault, named_fault: NamedFault, truth: FormTruth) -> float:
+    """Return the fraction of the points for a correction and its value."""
+    named_value = named_fault.value_in_first_unit()
     fractions = [
         fraction
-        if (low, high) == ANY_BOUNDS
+        if (low, high) == NO_BOUNDS
         else fraction
         * (0.5 if named_value is None else _value_fraction(named_value, low, high, 0.5))
-        for parameter, (low, high), fraction in accepted_corrections(mistake, truth)
-        if parameter == student_mistake.parameter
+        for parameter, (low, high), fraction in accepted_corrections(fault, truth)
+        if parameter == named_fault.parameter
     ]
     return max(fractions, default=0.0)
 
@@ -323,11 +313,10 @@ def _value_fraction(value: float, low: float, high: float, fraction_outside: flo
 AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 
-def accepted_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[AcceptedCorrection, ...]:
-    """Return the parameters that correct an injected fault, with bounds of accepted values."""
-    size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
-    from_s = mistake.from_s or 0.0
-    until_s = from_s if mistake.until_s is None else mistake.until_s
+def accepted_corrections(fault: InjectedFault, truth: FormTruth) -> tuple[AcceptedCorrection, ...]:
+    size, low, high = (value or 0.0 for value in (fault.size, fault.low, fault.high))
+    from_s = fault.from_s or 0.0
+    until_s = from_s if fault.until_s is None else fault.until_s
     bounds_by_name = {
         "negated": (-high, -low),
         "size": (low, high),
@@ -342,26 +331,26 @@ def accepted_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[Accept
         (
             rule.parameter,
             bounds_by_name[values] if isinstance(values := rule.right_values, str) else values,
-            rule.fraction_by_mistake[mistake.kind],
+            rule.fraction_by_kind[fault.kind],
         )
         for rule in CORRECTIONS
-        if mistake.kind in rule.fraction_by_mistake
+        if fault.kind in rule.fraction_by_kind
         # EKF2_EV_DELAY cannot be negative
         and (size > 0.0 or rule.right_values != "late milliseconds")
     )
 
 
 def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for the verdicts on KF and EKF2, and EKF2's behaviour."""
+    """Return the fraction of the points for both consistency verdicts and EKF2's behaviour."""
     pairs = (answers.verdict_kf, truth.kf.verdict), (answers.verdict_ekf2, truth.ekf2.verdict)
     right_count = sum(answer == (right or NOT_AVAILABLE) for answer, right in pairs)
     return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
 
 
 def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return 1 if the form names EKF2's behaviour completely, 1/2 with one error, else 0.
+    """Return 1 if the form names EKF2's behaviour correctly, 1/2 with one error, else 0.
 
-    An error is a missing or a false statement.
+    An error is a missing or a wrong behaviour.
     """
     stated_behaviours, required_behaviours = set(answers.ekf2_did), set(truth.ekf2_did)
     also_allowed = set(truth.ekf2_did_also)
@@ -375,7 +364,7 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _choices_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for choices: negative, so that guesses average to zero."""
+    """Return the mean score of the figure questions, where guesses give 0 on average."""
     wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
     right_letters = (right_letter for _, right_letter in truth.choices)
     points = (
@@ -387,8 +376,8 @@ def _choices_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for the numbers of KF that the student computed."""
-    # an empty list of updates is the right answer on most flights, so it has no points
+    """Return the fraction of the points for the KF numbers that the student computed."""
+    # an empty list of updates is right on most flights and could be guessed, so it has no points
     scored_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
     return sum(_quantity_fraction(*pair) for pair in pairs) / max(scored_count, 1)

@@ -1,4 +1,4 @@
-"""Grading of a class: verification of all submissions in parallel, and output files."""
+"""Grading of a class: parallel verification of all submissions, and output files."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ class GradeOutcome:
     notes : tuple of str
         Sentences about ignored files and overrides, and grades that could not be entered.
     reused_count : int
-        Number of reports whose stored verification was loaded.
+        Number of reports with a stored verification, which were not verified again.
     written_paths : tuple of Path
     """
 
@@ -122,14 +122,15 @@ def grade(
 def grade_submission(
     rubric: Rubric,
     key: AnswerKey | None,
-    logs: Mapping[str, Path],
+    path_by_sha256: Mapping[str, Path],
     records: Path,
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify and score a submission, given with the student id on the learning platform.
+    """Read, verify and score a submission.
 
-    Return the graded report, and True if a stored verification was loaded.
+    ``job`` is the submission and the student id on the learning platform. Return the graded report,
+    and True if a stored verification was loaded.
     """
     max_log_bytes.set(max_bytes)
     submission, submitter_id = job
@@ -138,7 +139,9 @@ def grade_submission(
     try:
         content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
-        results, verdict, is_loaded = load_or_verify(records, content, logs, assigned_hashes)
+        results, verdict, is_loaded = load_or_verify(
+            records, content, path_by_sha256, assigned_hashes
+        )
     except ResultsError as error:
         graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
     else:

@@ -21,10 +21,10 @@ class ItemStatistics:
     Attributes
     ----------
     fractions : tuple of float
-        Points of each report divided by the maximum; for a fault 1 if the form names it, else 0.
+        Points of each report divided by the maximum; for a fault, 1 if the form names the fault.
     discrimination : float or None
-        Correlation with the other points of the same reports (point-biserial for a fault). A value
-        near 0 or below means that good students do not get more points here than others.
+        Correlation with the other points of the same reports. Good students do not get more points
+        for an item with a value near or below 0.
     """
 
     title: str

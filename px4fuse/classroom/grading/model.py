@@ -12,7 +12,6 @@ from px4fuse.verification.model import Verification
 # Title of the sum over all rubric items, in overrides.csv and messages
 TOTAL_TITLE = "total"
 
-
 UNKNOWN_PERSON = Person("")
 
 
@@ -32,7 +31,7 @@ class ExportOrigin:
     is_late : bool
         True if the platform marks the file as late.
     is_imitated : bool
-        True if the student chose a name that looks like a file name of a platform.
+        True if the student imitated the file name of a platform.
     """
 
     platform: str = ""
@@ -56,9 +55,9 @@ class Submission:
     zip_entry : str
         Name of the entry in the zip file; "" for a file.
     name : str
-        Unique name for messages: one line of at most 200 characters.
+        Unique name for messages, with at most 200 characters.
     time : datetime or None
-        Time of the zip entry, in an unknown time zone: time of the submission or of the download.
+        Time of the zip entry (submission or download), in an unknown time zone.
     """
 
     file: Path
@@ -72,7 +71,7 @@ class Submission:
 class Item:
     """Points of a report for one item of the rubric, with a comment for the student.
 
-    ``awaits_points``: True if the instructor has to score this item and has not done it yet.
+    ``awaits_points`` is True until the instructor scores an item that px4fuse cannot score.
     """
 
     title: str
@@ -126,12 +125,12 @@ class GradedReport:
 
     @property
     def status(self) -> str:
-        """Status of the verification, or "page differs" if only pages differ."""
+        """Status of the verification; "page differs" if only pages differ."""
         return self.verdict.outcome
 
     @property
     def points(self) -> float:
-        """Sum of the points of all items, also while the instructor has to decide."""
+        """Sum of the points of all items, with those that do not count yet."""
         return sum(item.points for item in self.items)
 
     @property
@@ -160,7 +159,7 @@ class GradedReport:
 
 @dataclass(frozen=True)
 class Override:
-    """Points or comment of the instructor, which replace the points and comment of px4fuse."""
+    """Points of the instructor, which replace those of px4fuse, and an additional comment."""
 
     points: float | None = None
     comment: str = ""
@@ -181,7 +180,7 @@ class Entry:
     deduction : float
         Points deducted for late submission.
     overrides : mapping
-        Points and comments of the instructor by rubric item, "total", or "" (the whole report).
+        Points and comments of the instructor, by item title, "total", or "" (the whole report).
     total : float or None
         Grade in points; None without a submission, and while the instructor has to decide.
     """
@@ -209,7 +208,7 @@ class Entry:
 
 
 def list_titles(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the titles of the columns with points of items and with numbers of reports."""
+    """Return the titles of all rubric items, and of all numbers of reports."""
     reports = [report for entry in entries if (report := entry.counted_report)]
     items = dict.fromkeys(item.title for report in reports for item in report.items)
     numbers = dict.fromkeys(title for report in reports for title in report.numbers)

@@ -1,4 +1,4 @@
-"""Questions for a short oral check of a student, from the student's own form and flight."""
+"""Questions for an oral check of a student, about the student's answer form and flight."""
 
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ from px4fuse.classroom.assignment.truth import FormTruth
 from px4fuse.classroom.grading.form_points import describe_right_answer, panels_showing
 from px4fuse.classroom.grading.model import Entry
 from px4fuse.core.text import one_line
-from px4fuse.results.answer_form import MISTAKES, NO_MISTAKE_KIND, PANELS, Answers
+from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
 
 # Question to the student, and the answer that the instructor can expect
 Question = tuple[str, str]
@@ -31,33 +31,33 @@ def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
 
 
 def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
-    """Yield questions on a completed form: about its faults, then about figures, errors first."""
-    named_kinds = [mistake.kind for mistake in form.mistakes]
-    true_kinds = [mistake.kind for mistake in truth.mistakes]
+    """Yield questions about the faults in a form, then about the figures, wrong answers first."""
+    named_kinds = [fault.kind for fault in form.mistakes]
+    true_kinds = [fault.kind for fault in truth.mistakes]
     flight_text = ", ".join(true_kinds) or "no fault"
     for kind in named_kinds:
-        if kind in (*true_kinds, NO_MISTAKE_KIND):
+        if kind in (*true_kinds, NO_FAULT_KIND):
             continue
         yield (
-            f"You named {kind} ({MISTAKES[kind].description}). Which panel would show this fault, "
-            "and does the panel of your report show it?",
+            f"You named {kind} ({FAULT_KINDS[kind].description}). Which panel would show this "
+            "fault, and does the panel of your report show it?",
             f"{' or '.join(panels_showing(kind))}. The panel does not show the fault. The flight "
             f"has {flight_text}.",
         )
-    for mistake in truth.mistakes:
-        description = MISTAKES[mistake.kind].description
-        if mistake.kind not in named_kinds:
+    for fault in truth.mistakes:
+        description = FAULT_KINDS[fault.kind].description
+        if fault.kind not in named_kinds:
             yield (
                 f"Your flight also has this fault: {description}. Show it in your report, and "
                 "state its size and time.",
-                f"{describe_right_answer(mistake)}.",
+                f"{describe_right_answer(fault)}.",
             )
             continue
-        blind_panels = [panel for panel in PANELS if panel not in panels_showing(mistake.kind)]
+        blind_panels = [panel for panel in PANELS if panel not in panels_showing(fault.kind)]
         yield (
-            f"You named {mistake.kind} ({description}). Show it in your report, and name a panel "
+            f"You named {fault.kind} ({description}). Show it in your report, and name a panel "
             "that cannot show it, with the reason.",
-            f"{describe_right_answer(mistake)}. Panels that cannot show the fault, for example: "
+            f"{describe_right_answer(fault)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )
     letters = dict(enumerate(form.choices))

@@ -113,7 +113,7 @@ def write_class(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    stems = file_names([_entry_identity(entry, stem=True) for entry in entries])
+    stems = file_names([_entry_identity(entry, use_file_stem=True) for entry in entries])
     page_entries = [
         _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
     ]
@@ -157,10 +157,10 @@ def write_class(
     return tuple(output / name for name in outputs), tuple(notes)
 
 
-def _entry_identity(entry: Entry, stem: bool = False) -> str:
-    """Return the id of a student, or else the name, or else the file name."""
+def _entry_identity(entry: Entry, use_file_stem: bool = False) -> str:
+    """Return the id of a student; without id the name, or the file name."""
     file = entry.counted_report.submission if entry.counted_report else ""
-    return entry.student_id or (Path(file).stem if stem else entry.student or file)
+    return entry.student_id or (Path(file).stem if use_file_stem else entry.student or file)
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
@@ -180,9 +180,9 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms, and sort by pseudonym; also return the table of names as CSV.
+    """Replace names by pseudonyms and sort by pseudonym; also return the pseudonyms as CSV table.
 
-    The pseudonyms in the table at ``path`` are kept, others are assigned in random order.
+    Pseudonyms in an existing table at ``path`` are kept.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -291,11 +291,11 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
 
 def feedback_text(entry: Entry, class_name: str = "") -> str:
     """Format the feedback for one student, without the flags for the instructor."""
-    graded = entry.counted_report
-    reasons = graded.verdict.reasons[:MAX_REASONS] if graded else ()
+    report = entry.counted_report
+    reasons = report.verdict.reasons[:MAX_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
         entry=entry,
-        graded=graded,
+        report=report,
         class_name=class_name,
         reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
         is_total_set=TOTAL_TITLE in entry.overrides,
@@ -346,13 +346,15 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index, title in title_by_index.items()
         if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
     ]
-    columns = assignments if grade_index is None else [grade_index]
+    candidate_indices = assignments if grade_index is None else [grade_index]
     # Moodle's worksheets have only one grade column, so --column may concern another table
     if column_title and (matches or sheet.column(("identifier",)) is None):
-        columns = matches
-    if len(columns) == 1:
-        return columns[0]
-    problem = "the table has several grade columns" if columns else "no grade column was found"
+        candidate_indices = matches
+    if len(candidate_indices) == 1:
+        return candidate_indices[0]
+    problem = (
+        "the table has several grade columns" if candidate_indices else "no grade column was found"
+    )
     titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
     remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
@@ -364,7 +366,7 @@ def fill_grades(
     register: Register,
     column: str,
     feedback: Sequence[str],
-    scale: float | None = None,
+    platform_max_points: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
@@ -398,9 +400,9 @@ def fill_grades(
         )
         if total_points is None:
             continue
-        if scale is not None and rubric_maximum:
-            total_points = round(total_points * scale / rubric_maximum, 2)
-        max_points = _platform_max_points(sheet, row, grade_index)
+        if platform_max_points is not None and rubric_maximum:
+            total_points = round(total_points * platform_max_points / rubric_maximum, 2)
+        max_points = _max_points_in_table(sheet, row, grade_index)
         if max_points is not None and total_points > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
@@ -425,8 +427,7 @@ def fill_grades(
     return replace(sheet, rows=tuple(map(tuple, cells_by_row))), tuple(notes)
 
 
-def _platform_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
-    """Return the maximum points on the learning platform, if its table contains them."""
+def _max_points_in_table(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
     maximum_texts = (
         cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
     )
@@ -434,7 +435,7 @@ def _platform_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> 
 
 
 def escape_html(text: str) -> str:
-    r"""Escape a text that the learning platform displays as HTML; keep the line breaks.
+    r"""Convert a text to HTML with the same line breaks.
 
     >>> escape_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'

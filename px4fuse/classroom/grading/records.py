@@ -27,13 +27,13 @@ from px4fuse.verification.verification import log_sha256, recompute, verify
 RECORDS_FOLDER = "records"
 # Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
-# Suffix of a report with px4fuse's diagnosis, which is the feedback on an assignment
+# Suffix of the report with px4fuse's diagnosis, which is feedback on an assigned flight
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """Stored verification: results attached to the PDF (JSON), and verdict without redrawn PDF.
+    """Results attached to a PDF (JSON), and result of its verification without the redrawn PDF.
 
     The record is valid while its ``dependencies`` are unchanged.
     """
@@ -44,7 +44,7 @@ class VerificationRecord:
 
 
 def load_or_verify(
-    records: Path, pdf: bytes, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+    records: Path, pdf: bytes, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification, bool]:
     """Read and verify a report, or load its stored verification.
 
@@ -54,8 +54,8 @@ def load_or_verify(
         Folder of the stored verifications.
     pdf : bytes
         Content of the submitted file.
-    logs : mapping
-        Logs and other input files by SHA-256.
+    path_by_sha256 : mapping
+        Logs and other input files.
     assigned_hashes : frozenset of str
         SHA-256 of the logs in the answer key.
 
@@ -74,16 +74,16 @@ def load_or_verify(
         The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if loaded := _load_record(records, sha256, logs, assigned_hashes):
+    if loaded := _load_record(records, sha256, path_by_sha256, assigned_hashes):
         return *loaded, True
     results = read_report(pdf, "The file")
-    dependencies = _dependencies(to_json(results), logs, assigned_hashes)
+    dependencies = _dependencies(to_json(results), path_by_sha256, assigned_hashes)
     # the verdict is "cannot verify" instead of "other log" if an assigned log is not available
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
-    verdict = verify(results, pdf, {} if is_log_missing else logs)
+    verdict = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_SUFFIX: verdict.redrawn_pdf} if verdict.redrawn_pdf else {}
     if verdict.status == "verified" and log_sha256(results) in assigned_hashes:
-        results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, logs)
+        results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, path_by_sha256)
     stored_verdict = replace(verdict, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verdict)
     _write_record(records, sha256, record, files)
@@ -91,12 +91,12 @@ def load_or_verify(
 
 
 def diagnose_assigned(
-    results: ReportedResults, logs: Mapping[str, Path]
+    results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> tuple[ReportedResults, bytes]:
-    """Repeat a verified analysis with px4fuse's diagnosis; return results and report."""
+    """Repeat the analysis of an assigned log with diagnosis; return results and report."""
     token = ignores_assessed.set(True)
     try:
-        outcome = recompute(results, logs)
+        outcome = recompute(results, path_by_sha256)
     finally:
         ignores_assessed.reset(token)
     if isinstance(outcome, Verification):
@@ -106,12 +106,12 @@ def diagnose_assigned(
 
 
 def _dependencies(
-    results: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the version of each library, and the availability of each input file by SHA-256."""
+    """Return the version of each library, and the availability of each input file."""
     return _versions() | {
         sha256: "available"
-        if sha256 in logs
+        if sha256 in path_by_sha256
         else "assigned"
         if sha256 in assigned_hashes
         else "missing"
@@ -137,13 +137,13 @@ def _write_record(
 
 
 def _load_record(
-    records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+    records: Path, sha256: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification] | None:
     """Load a stored verification; None if there is none, or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
-        if record.dependencies != _dependencies(record.results, logs, assigned_hashes):
+        if record.dependencies != _dependencies(record.results, path_by_sha256, assigned_hashes):
             return None
         results = read_results(record.results.encode())
     # if the stored verification cannot be read, the report is verified again

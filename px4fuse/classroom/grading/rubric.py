@@ -1,7 +1,7 @@
-"""Rubric, the instructor's table of items that give points: reading, and scoring of a report.
+"""Reading of a rubric, the instructor's list of items that give points, and scoring of reports.
 
 An item has a title, points, a check of :mod:`px4fuse.classroom.grading.checks` and parameters of
-the check. A number that a report does not contain gives no points and a comment.
+the check.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
 
 
 def _describe_place(path: re.Match[str]) -> str:
-    """Replace the path in an error of msgspec by the item number (from 1) and the field."""
+    """Convert the path in an error of msgspec to item number (from 1) and field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
@@ -198,7 +198,7 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
     first_reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{first_reason}"
-    # problems of the report: rule of the rubric, text for the student, action of the instructor
+    # problems of the report: rule of the rubric, reason for the student, action of the instructor
     problems: list[tuple[PointsRule, str, str]] = []
     if verdict.status != "verified":
         action = verdict.remedy or f"Check the report by hand: it was not verified{first_reason}."
@@ -227,7 +227,7 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
 
 
 def _foreign_log_advice(check_input: CheckInput) -> str:
-    """Describe the instructor's action for a report on a log of another student."""
+    """Return the instructor's action for a report on a log of another student."""
     student_id = shorten_text(check_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if check_input.submitter_id:

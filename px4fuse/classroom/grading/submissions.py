@@ -44,12 +44,12 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES
 
 # Maximum number of entries of a submitted zip file
 MAX_ZIP_ENTRIES = 10_000
-# Maximum size (bytes) of the table of contents of a zip file, which zipfile reads completely
+# Maximum size (bytes) of the central directory of a zip file, which zipfile reads completely
 MAX_DIRECTORY_BYTES = 4_000_000
-# Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: they may share their data
-MAX_TOTAL_BYTES = 4_000_000_000
-# Maximum ratio of unpacked to packed size of a zip entry: the ratio of a PDF is near 1, because it
-# is compressed already
+# Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: entries of a zip bomb
+# overlap
+MAX_UNPACKED_BYTES = 4_000_000_000
+# Maximum ratio of unpacked to packed size of a zip entry; near 1 for a PDF, which is compressed
 MAX_COMPRESSION_RATIO = 100
 # Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
@@ -70,7 +70,7 @@ PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Texts that a platform writes once into a path: the student wrote any further occurrence
+# Texts that a platform writes once into a path: a second occurrence is from the student
 _PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_BLOCK = re.compile(
@@ -89,7 +89,7 @@ _UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
 def _unread_reason(error: Exception) -> str:
-    """Return the reason why a file was not read, for a message that begins with its name."""
+    """Return the reason why a file was not read."""
     if isinstance(error, _EntryError):
         return str(error)
     reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
@@ -120,7 +120,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     """
     notes: list[str] = []
     submission_by_path: dict[tuple[Path, str], Submission] = {}
-    origin_by_number: dict[str, ExportOrigin] = {}
+    origin_by_submission_number: dict[str, ExportOrigin] = {}
     ignored_names, zip_count = list[str](), 0
     for path in paths:
         is_export = path.is_file() and path.name.lower().endswith(".zip")
@@ -135,7 +135,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
             else:
                 try:
                     text = read_submission(submission).decode("utf-8", errors="replace")
-                    origin_by_number |= read_gradescope_metadata(text)
+                    origin_by_submission_number |= read_gradescope_metadata(text)
                 except ResultsError as error:
                     notes.append(str(error))
     if ignored_names:
@@ -160,17 +160,17 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     named_submissions = [
         replace(submission, name=name) for submission, name in zip(submissions, names, strict=True)
     ]
-    return tuple(add_origins(named_submissions, origin_by_number)), tuple(notes)
+    return tuple(add_origins(named_submissions, origin_by_submission_number)), tuple(notes)
 
 
 def add_origins(
-    submissions: Sequence[Submission], origin_by_number: Mapping[str, ExportOrigin]
+    submissions: Sequence[Submission], origin_by_submission_number: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
     """Add student and learning platform to submissions.
 
     All files of an export (zip file or top-level folder) are from the platform whose pattern
     matches most of them, so that a student cannot imitate the file names of another platform.
-    ``origin_by_number`` contains students and times by Gradescope's submission number.
+    ``origin_by_submission_number`` contains students and times by Gradescope's submission number.
     """
     exports = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
@@ -185,7 +185,9 @@ def add_origins(
         if origin.platform in ("gradescope", ""):
             # Gradescope exports PDF assignments as 123456.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
-            origin = origin_by_number.get(origin.person.numbers.get("gradescope", stem), origin)
+            origin = origin_by_submission_number.get(
+                origin.person.numbers.get("gradescope", stem), origin
+            )
         yield replace(submission, origin=origin)
 
 
@@ -228,7 +230,7 @@ class _LimitedFile:
 
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
-            raise zipfile.BadZipFile("the table of contents of the zip file is too large")
+            raise zipfile.BadZipFile("the central directory of the zip file is too large")
         # zipfile calls read() without a size only to find the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
 
@@ -247,8 +249,10 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
         # zipfile never returns more than the declared size of an entry
-        if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
-            raise _EntryError(f"the zip file unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+        if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
+            raise _EntryError(
+                f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
+            )
     except _UNREADABLE_ERRORS as error:
         notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
         return []
@@ -314,7 +318,7 @@ def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
 
 
 def _entry_label(entry: zipfile.ZipInfo) -> str:
-    """Return the path of a zip entry for messages, without ``.``, ``..`` and drive letters."""
+    """Return the path of a zip entry without ``.``, ``..`` and drive letters, for messages."""
     name = entry.filename
     if not entry.flag_bits & _UTF8_FLAG:
         # zipfile decodes names without UTF-8 flag as code page 437, but most programs write UTF-8
@@ -329,7 +333,7 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Read an entry of a zip file; reject types of entries that learning platforms do not write."""
+    """Read a zip entry; reject kinds of entries that learning platforms do not write."""
     entry = archive.getinfo(name)
     max_unpacked_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
     rejection_reason = ""
