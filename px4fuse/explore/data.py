@@ -48,7 +48,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
             axis_signals | _axis_data(analysis, result, packer)
             for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
-        "likely": _likely_noises(analysis),
+        "likely": _ml_noises_by_axis(analysis),
         "events": {
             "gap": events.gaps,
             "dropout": events.dropouts,
@@ -249,8 +249,7 @@ def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
-def _likely_noises(analysis: Analysis) -> PageData:
-    """Return the maximum-likelihood estimates of SIGMA_A and SIGMA_Z by axis."""
+def _ml_noises_by_axis(analysis: Analysis) -> PageData:
     return {
         name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
         for name, axis_tuning in analysis.tuning.items()

@@ -198,7 +198,7 @@ def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[di
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
-        "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
+        "card": card_html(_with_fault_headline(card, descriptions), has_apply=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
     elements = data_scripts(data, analysis, packer, f"-{flight_index}")
@@ -233,7 +233,7 @@ def size_parts(size: str) -> list[str]:
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
 
 
-def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
+def _with_fault_headline(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     if card.causes or not descriptions:
         return card
     fault_text = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)

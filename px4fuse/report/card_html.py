@@ -76,19 +76,19 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     )
 
 
-def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
     ``axis`` is the title of the spatial axis of the errors; ``name`` identifies it for scripts.
     """
     return load_template("report/card_axis.html").render(
-        verdicts=all_verdicts,
+        verdicts=verdicts,
         axis=axis,
         name=name,
         marks=axis_marks,
         paths=MARK_PATHS,
         percent=_axis_percent,
-        alternative=alternative_text(all_verdicts),
+        alternative=alternative_text(verdicts),
         ticks=[
             (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()

@@ -27,13 +27,13 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command
 
-CARD_WIDTH = 100
-AXIS_WIDTH = 37
+CARD_WIDTH = 100  # number of characters
+AXIS_WIDTH = 37  # number of characters of the axis of σ ratios
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters left of a text beside a label
 # Maximum length (characters) of a command beside its label; longer commands get their own line
 MAX_COMMAND_LENGTH = 74
-# σ ratios at labelled ticks of the axis of σ ratios
+# Labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
@@ -301,8 +301,8 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         }
         for rerun in reruns
     ]
-    heads = rows[0] if rows else ()
-    columns = [(head, *(row[head] for row in rows)) for head in heads]
+    headings = rows[0] if rows else ()
+    columns = [(head, *(row[head] for row in rows)) for head in headings]
     return [column for column in columns if any(column[1:])]
 
 

@@ -69,10 +69,9 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
         f"along {axis_text}; the table lists all axes.",
     )
-    innovations_by_filter = _tested_innovations(result)
-    if innovations_by_filter:
+    if innovations := _tested_innovations(result):
         title = "Running mean NIS (log scale)"
-        axes = event_marks.panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
+        axes = event_marks.add_panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
         left_column, right_column = two_columns()
         histogram_axes = left_column.panel(
             "Distribution of ν/√S", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
@@ -80,12 +79,12 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         autocorrelation_axes = right_column.panel(
             "Autocorrelation",
             DISTRIBUTION_HEIGHT,
-            caption=_whiteness_sentence(result, innovations_by_filter),
+            caption=_whiteness_sentence(result, innovations),
             above=LEGEND_HEIGHT,
         )
-        _draw_running_nis(axes, innovations_by_filter)
-        _draw_histogram(histogram_axes, innovations_by_filter)
-        _draw_autocorrelation(autocorrelation_axes, innovations_by_filter)
+        _draw_running_nis(axes, innovations)
+        _draw_histogram(histogram_axes, innovations)
+        _draw_autocorrelation(autocorrelation_axes, innovations)
         for labelled_axes in (axes, histogram_axes, autocorrelation_axes):
             draw_legend_above(labelled_axes)
         page.add_columns(left_column, right_column)
@@ -114,7 +113,6 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs of KF and EKF2, each with one changed setting."""
     axis = analysis.main.axis
     tested_trials: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
@@ -156,9 +154,9 @@ def _thin_line_style(name: str) -> dict[str, Any]:
     return line_style(TRACK_LINES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
-def _draw_running_nis(axes: Axes, innovations_by_filter: InnovationsByFilter) -> None:
+def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
     min_drawn_nis, max_drawn_nis = 0.5, 2.0
-    for name, values in innovations_by_filter.items():
+    for name, values in innovations.items():
         innovation_counts = np.arange(1, len(values) + 1)
         running_nis = (values**2).cumsum() / innovation_counts
         draw_curve(axes, running_nis.iloc[2:], **TRACK_LINES[name], label=name)
@@ -175,12 +173,12 @@ def _draw_running_nis(axes: Axes, innovations_by_filter: InnovationsByFilter) ->
     set_plain_ticks(axes)
 
 
-def _draw_histogram(axes: Axes, innovations_by_filter: InnovationsByFilter) -> None:
-    innovations = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
-    normal_density = np.exp(-0.5 * innovations**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(innovations, normal_density, color="#dcdcdc", lw=0, label="normal")
+def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
+    grid = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
+    normal_density = np.exp(-0.5 * grid**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(grid, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
-    for name, values in innovations_by_filter.items():
+    for name, values in innovations.items():
         drawn_values = values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
         density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
         axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
@@ -191,8 +189,8 @@ def _draw_histogram(axes: Axes, innovations_by_filter: InnovationsByFilter) -> N
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, innovations_by_filter: InnovationsByFilter) -> None:
-    for shift, (name, values) in zip((-0.18, 0.18), innovations_by_filter.items(), strict=False):
+def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
+    for shift, (name, values) in zip((-0.18, 0.18), innovations.items(), strict=False):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = autocorrelation(np.asarray(values, np.float64), lag_count)
         lag_positions = np.arange(1, lag_count + 1) + shift
@@ -215,9 +213,9 @@ def _whiteness_half_band(values: pd.Series[float]) -> float:
     return float(1.96 / np.sqrt(len(values)))
 
 
-def _whiteness_sentence(result: AxisComparison, innovations_by_filter: InnovationsByFilter) -> str:
+def _whiteness_sentence(result: AxisComparison, innovations: InnovationsByFilter) -> str:
     sentences = []
-    for name, values in innovations_by_filter.items():
+    for name, values in innovations.items():
         consistency = statistics_by_filter(result)[name]
         assert isinstance(consistency, Consistency)
         lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p

@@ -257,16 +257,16 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
 
 
 def _innovation_plot(result: AxisComparison) -> TimePlot:
-    series = normalised_innovations(result)
-    legend = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
-    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
+    innovations = normalised_innovations(result)
+    legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
+    titles = [f"Innovations ÷ √S ({legend}): 95 % expected within ±2"]
     largest_texts = [
         f"{name} {format_ratio(ratio)}"
-        for name, values in series.items()
+        for name, values in innovations.items()
         if (ratio := float(values.abs().max())) > MAX_DRAWN_INNOVATION
     ]
     if largest_texts:
-        title += f"; ▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}"
+        titles.append(f"▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}")
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_DRAWN_INNOVATION, 1.12 * MAX_DRAWN_INNOVATION)
@@ -274,10 +274,10 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
         axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         axes.axhline(0.0, color="black", lw=0.5)
-        for name in reversed(series):
-            draw_dots(axes, series[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
+        for name in reversed(innovations):
+            draw_dots(axes, innovations[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
 
-    return TimePlot(title, draw)
+    return TimePlot("; ".join(titles), draw)
 
 
 def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:

@@ -52,7 +52,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
             page.heading(f"{name}: no result")
             page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
         else:
-            _draw_axis(page, name, explanation, analysis)
+            _draw_axis_explanation(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)
     assert replay.agreement is not None
@@ -102,20 +102,21 @@ def format_agreement(agreement: Agreement) -> str:
         f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
         for axis in agreement.axes.values()
     )
-    return (
+    sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
         f"Correlation of {agreement.samples} innovations {correlation_text}; S of the replay ÷ S "
         f"of the log {ratio_text}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
-        f"{agreement.rejected_fraction_logged:.1%})"
-        + "".join(
-            f". The replay of {AIDS[name].label} does not agree with the log and is not used: "
+        f"{agreement.rejected_fraction_logged:.1%})",
+        *(
+            f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"
             for name, reason in agreement.doubtful.items()
-        )
-    )
+        ),
+    ]
+    return ". ".join(sentences)
 
 
-def _draw_axis(
+def _draw_axis_explanation(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
     span_texts = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
@@ -144,7 +145,7 @@ def _draw_axis(
         _draw_waterfall(axes, setting_names, *percents)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    axes = event_marks.panel(
+    axes = event_marks.add_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m, dark) and unexplained difference (light)",

@@ -50,7 +50,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
     page.write(ate_sentence(evaluation), size=9.0, bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
-    _draw_panels(page, evaluation)
+    _draw_ape_and_rpe(page, evaluation)
     yield page
 
 
@@ -110,7 +110,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
     bar.outline.set_linewidth(0.5)
 
 
-def _draw_panels(page: Page, evaluation: Evaluation) -> None:
+def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
     left_column, right_column = two_columns()
     axes = left_column.panel("APE over time (m)", PANEL_HEIGHT)
     origin_s = time_origin_s(evaluation)
@@ -283,10 +283,10 @@ def describe_track(path: Trajectory) -> str:
 
 def describe_method(evaluation: Evaluation) -> str:
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
-    offset_text = "" if not offset_s else f"; time offset {offset_s:+.3f} s"
-    return (
-        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
+    texts = [
+        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')})",
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
         f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
-        f"reference{offset_text}"
-    )
+        "reference",
+    ]
+    return "; ".join(texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))

@@ -58,7 +58,7 @@ def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tup
 def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
     """Draw gaps, resets, rejections and outliers on a time axis.
 
-    ``axis`` selects the rejections: by default those of the main axis, none for "".
+    ``axis``: axis whose rejected measurements are drawn; None for the main axis, "" for none.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -82,7 +82,7 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
 
 
-def panel(
+def add_panel(
     page: Page,
     analysis: Analysis,
     title: str,

@@ -118,7 +118,6 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    """Draw the reference trajectory in the frame of the odometry."""
     for reference in loop.references[:1]:
         evaluation = loop.best.scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
@@ -165,8 +164,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         if path.correction_max_m:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
         ate_texts = [
-            _format_error(score.ate.translation_m, score.ate.interval_m)
-            if isinstance(score := path.scores[name], Evaluation)
+            _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
+            if isinstance(evaluation := path.scores[name], Evaluation)
             else "–"
             for name in names
         ]
@@ -201,23 +200,27 @@ def write_scores(page: Page, loop: Loop) -> None:
         page.table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.heading(f"RPE against {reference.name}")
-        scores = {path.name: path.scores[reference.name] for path in loop.reported_paths}
-        missing_scores = [score for score in scores.values() if isinstance(score, Unavailable)]
-        for reason in dict.fromkeys(score.reason for score in missing_scores):
+        evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
+        for path in loop.reported_paths:
+            evaluation = path.scores[reference.name]
+            if isinstance(evaluation, Unavailable):
+                reasons[evaluation.reason] = None
+            else:
+                evaluations[path.name] = evaluation
+        for reason in reasons:
             page.write(reason)
         rows = [
             [
                 name,
-                *(_format_error(error.translation_m, error.interval_m) for error in score.rpe),
-                _format_rmse(score.ate.rotation_deg, 2),
+                *(_format_error(error.translation_m, error.interval_m) for error in evaluation.rpe),
+                _format_rmse(evaluation.ate.rotation_deg, 2),
             ]
-            for name, score in scores.items()
-            if isinstance(score, Evaluation)
+            for name, evaluation in evaluations.items()
         ]
-        for first in [score for score in scores.values() if isinstance(score, Evaluation)][:1]:
-            delta_heads = [f"{error.delta_text} (m)" for error in first.rpe]
+        for evaluation in [*evaluations.values()][:1]:
+            delta_heads = [f"{error.delta_text} (m)" for error in evaluation.rpe]
             page.table(["path", *delta_heads, "rotation (°)"], rows)
-            for text in (describe_method(first), *first.notes, *first.warnings):
+            for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
                 page.write_small(capitalise_first(text))
 
 

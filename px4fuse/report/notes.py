@@ -53,10 +53,10 @@ def write_markdown(page: Page, notes: str) -> None:
     """
     from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
 
-    _write_blocks(page, SyntaxTreeNode(parse(notes)), 0)
+    _write_blocks(page, SyntaxTreeNode(parse_markdown(notes)), 0)
 
 
-def parse(notes: str, name: str = "the notes") -> list[Token]:
+def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
     """Parse Markdown into tokens; ``name`` names the text in error messages.
 
     Raises

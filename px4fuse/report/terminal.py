@@ -74,14 +74,14 @@ def card_page(block_kind: str, card: Card) -> Page:
 
 def _describe_setup(comparison: Comparison) -> dict[str, str]:
     source, segment = comparison.source, comparison.segment
-    position = (
+    position_text = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
     alignment = {} if source.alignment is None else describe_alignment(source.alignment)
     return {
         "Filter": format_settings(comparison.settings),
-        "Position": position,
+        "Position": position_text,
         **{capitalise_first(label): text for label, text in alignment.items()},
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
     }
