@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array, cumulative_integral
+from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
@@ -220,18 +220,13 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     return jitter_s if is_jitter else None
 
 
-def _rank_correlation(first: Array, second: Array) -> float:
-    """Return Spearman's rank correlation (importing scipy.stats takes 0.2 s)."""
-    return float(pd.Series(first).rank().corr(pd.Series(second).rank()))
-
-
 def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
     speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
     # noise that is larger in one part of the flight correlates with speed in a few parts only
     significances = [
-        _rank_correlation(sizes_m[part], speed_m_s[part]) * np.sqrt(len(part) / SHARED_RESIDUALS)
+        rank_correlation(sizes_m[part], speed_m_s[part]) * np.sqrt(len(part) / SHARED_RESIDUALS)
         for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
         if np.ptp(sizes_m[part]) and np.ptp(speed_m_s[part])
     ]
