@@ -212,10 +212,10 @@ def _draw_report(
     analysis: object, results: ReportedResults, submitted_provenance: Provenance
 ) -> bytes:
     """Draw the report with the library versions that the submitted report states."""
-    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(submitted_provenance, command=results.provenance.command)
-    return render(analysis, replace(results, provenance=new_provenance), to_json(results))
+    return render_pdf(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
 # ------------------------------------------------------------------ the verdict
